@@ -1,0 +1,142 @@
+"""The registry of domains: what a folder of `envs/` declares so that every face, policy and command works with it.
+
+A third domain costs one folder that builds a `Domain` and calls `register`, and one line in
+`marl_sched.envs` that imports it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from marl_sched.errors import UnknownNameError
+
+if TYPE_CHECKING:
+    from gymnasium.spaces import Space
+
+    from marl_sched.simulation import TurnSimulator
+
+
+class Instance(Protocol):
+    """What the rooms need to know of any domain's problem instance."""
+
+    @property
+    def identity(self) -> int:
+        """A 64-bit hash of the content: the instance's name in counter-based randomness."""
+
+    def save(self, path: Path) -> None:
+        """Write as JSON, whole or not at all."""
+
+
+class CentralFace(Protocol):
+    """How the centralised Gymnasium face speaks: one action decides for the whole team."""
+
+    def action_space(self, simulator: TurnSimulator) -> Space:
+        """The space of a joint action."""
+
+    def play(self, simulator: TurnSimulator, action: Any) -> tuple[float, dict[str, Any]]:
+        """Take all turns that a joint action covers in row 0; the reward it brought and the step's infos."""
+
+
+class Telemetry(Protocol):
+    """How a domain's true state is told over a wire, and what an agent may hear of it under its view.
+
+    Both sides are pure: bytes in, bytes out, no transport. A channel is the part of a key after the run's name.
+    """
+
+    def messages(self, simulator: TurnSimulator) -> dict[str, bytes]:
+        """Everything the world says at this moment: channel -> payload."""
+
+    def channels(self, agent: int, simulator_options: Mapping[str, Any]) -> list[str]:
+        """The channels that this agent's view allows it to hear, sorted."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Domain:
+    """One scheduling problem as the rooms see it.
+
+    Attributes:
+        name: as in `--env`.
+        title: one line for `marl-sched list`.
+        scales: the instance generator's settings by name, smallest first.
+        objectives: names of the rewards to choose from, the default first.
+        views: view name -> dataclass of the view's options.
+        agent_prefix: agents are called `<prefix>_<i>`.
+        generate: (scale, rng) -> instance.
+        load: path -> instance; raises InvalidFileError.
+        instance_type: the class of its instances.
+        simulator: (instances, **options) -> TurnSimulator. Every domain understands the options `view`,
+            `objective`, `horizon`, `seed` and `pad` (a scale's name whose largest instance sets the padding,
+            or None: the largest of the given instances); unknown options raise TypeError.
+        central: the centralised face.
+        render: mode -> function of a simulator row, `ansi` gives str, `rgb_array` gives uint8 (H, W, 3).
+        default_horizon: simulated time of an episode.
+    """
+
+    name: str
+    title: str
+    scales: Mapping[str, Any]
+    objectives: tuple[str, ...]
+    views: Mapping[str, type]
+    agent_prefix: str
+    generate: Callable[[str, np.random.Generator], Any]
+    load: Callable[[Path], Any]
+    instance_type: type
+    simulator: Callable[..., TurnSimulator]
+    central: CentralFace
+    render: Mapping[str, Callable[[TurnSimulator, int], Any]]
+    default_horizon: int
+    extras: Mapping[str, Any] = field(default_factory=dict)
+
+    def agent_name(self, agent: int) -> str:
+        """`crew_3` for agent 3 of a domain whose agents are crews."""
+        return f"{self.agent_prefix}_{agent}"
+
+    def instances(self, scale: str, count: int, seed: int) -> list[Any]:
+        """`count` instances of a scale; instance i depends on (seed, i) alone."""
+        self.require_scale(scale)
+        return [self.generate(scale, np.random.default_rng([seed, i])) for i in range(count)]
+
+    def require_scale(self, scale: str) -> str:
+        """The scale's name, or UnknownNameError."""
+        return _require(f"scale of {self.name}", scale, self.scales)
+
+    def require_objective(self, objective: str) -> str:
+        """The objective's name, or UnknownNameError."""
+        return _require(f"objective of {self.name}", objective, self.objectives)
+
+
+_DOMAINS: dict[str, Domain] = {}
+
+
+def register(domain: Domain) -> Domain:
+    """Make a domain known by its name; a name can be taken once."""
+    if domain.name in _DOMAINS:
+        raise ValueError(f"domain {domain.name!r} is registered already")
+    _DOMAINS[domain.name] = domain
+    return domain
+
+
+def get_domain(name: str) -> Domain:
+    """The domain of that name, or UnknownNameError that lists the known ones."""
+    import marl_sched.envs  # noqa: F401  (registers the domains that ship with the package)
+
+    _require("environment", name, _DOMAINS)
+    return _DOMAINS[name]
+
+
+def domain_names() -> list[str]:
+    """Names of all registered domains, sorted."""
+    import marl_sched.envs  # noqa: F401
+
+    return sorted(_DOMAINS)
+
+
+def _require(what: str, name: str, known: Iterable[str]) -> str:
+    if name not in known:
+        raise UnknownNameError(what, name, known)
+    return name

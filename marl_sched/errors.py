@@ -1,0 +1,52 @@
+"""Typed errors: every one names what is wrong, where, and what was expected.
+
+The command line prints the message of a `MarlSchedError` as one line and exits with code 2; anything
+else is a defect and keeps its traceback.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class MarlSchedError(Exception):
+    """Base of all errors that a user can cause and mend."""
+
+
+class UnknownNameError(MarlSchedError, ValueError):
+    """A name that is not registered; the message lists the names that are."""
+
+    def __init__(self, what: str, name: object, known: Iterable[str]) -> None:
+        names = sorted(known)
+        close = difflib.get_close_matches(str(name), names, n=1)
+        hint = f"; did you mean {close[0]!r}?" if close else "."
+        super().__init__(f"unknown {what} {name!r}{hint} Known: {', '.join(names) or 'none'}")
+        self.what, self.name, self.known = what, name, names
+
+
+class InvalidFileError(MarlSchedError, ValueError):
+    """A file that does not hold what it should: `FILE: field: expected ..., got ...`."""
+
+    def __init__(self, path: object, field: str, expected: str, got: object | None = None) -> None:
+        tail = "" if got is None else f", got {_shorten(got)}"
+        where = f"{path}: {field}: " if field else f"{path}: "
+        super().__init__(f"{where}expected {expected}{tail}")
+        self.path, self.field = str(path), field
+
+
+class InvalidOptionError(MarlSchedError, ValueError):
+    """An option outside its domain, such as a negative reach or a horizon of zero hours."""
+
+
+class IllegalActionError(MarlSchedError, ValueError):
+    """A choice that the action mask forbids or that lies outside the action space."""
+
+
+class DeploymentError(MarlSchedError, RuntimeError):
+    """A distributed run that could not start or finish; the message names the process that is at fault."""
+
+
+def _shorten(value: object, limit: int = 60) -> str:
+    text = repr(value)
+    return text if len(text) <= limit else text[: limit - 3] + "..."

@@ -1,0 +1,50 @@
+"""Reading and writing files: JSON in with errors that name file and field, everything out whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from marl_sched.errors import InvalidFileError
+
+
+@contextmanager
+def replacing(path: str | Path) -> Iterator[Path]:
+    """A temporary path beside `path` that takes its place when the block ends well, and vanishes otherwise."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=path.suffix, dir=path.parent)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        umask = os.umask(0)
+        os.umask(umask)
+        temporary.chmod(0o666 & ~umask)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_json(path: str | Path, data: Any) -> None:
+    """Write `data` as indented JSON, beside and renamed."""
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(data, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def read_json(path: str | Path) -> Any:
+    """The JSON value in a file; InvalidFileError says where it is malformed or why it cannot be read."""
+    path = Path(path)
+    try:
+        return json.loads(path.read_bytes())
+    except OSError as error:
+        raise InvalidFileError(path, "", f"a readable file ({error.strerror})") from error
+    except UnicodeDecodeError as error:
+        raise InvalidFileError(path, f"byte {error.start}", "UTF-8 text") from error
+    except json.JSONDecodeError as error:
+        raise InvalidFileError(path, f"line {error.lineno} column {error.colno}", f"valid JSON ({error.msg})") from error
