@@ -1,0 +1,71 @@
+"""What decides: one protocol for rules, solvers and learned policies.
+
+A `Scheduler` takes the turn of the acting agent in every row of a simulator. One that needs no more than
+what the agent sees is an `ObservationScheduler`: the same object then works centralised (a full view), as
+one agent among others (a local view), in PettingZoo, and in an agent process that never meets a simulator.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+
+import numpy as np
+
+from marl_sched.graph import ACTION_MASK
+from marl_sched.simulation import TurnSimulator
+
+
+class Scheduler(ABC):
+    """Chooses targets for acting agents.
+
+    Attributes:
+        name: as users type it.
+        needs: what it uses beyond the acting agent's observation, in words, or "" for nothing;
+            printed with every result (for example "failure model").
+    """
+
+    name: str
+    needs: str = ""
+
+    def start(self, simulator: TurnSimulator, rows: np.ndarray) -> None:
+        """Called after `rows`, bool (B,), began a new episode; planners make their plans here."""
+
+    @abstractmethod
+    def decide(self, simulator: TurnSimulator) -> np.ndarray:
+        """Targets int64 (B,) for the acting agents; rows that are over get 0."""
+
+
+class ObservationScheduler(Scheduler):
+    """A scheduler that needs only the acting agent's observation and, to sample, one uniform."""
+
+    @abstractmethod
+    def choose(self, observation: Mapping[str, np.ndarray], uniform: np.ndarray) -> np.ndarray:
+        """Targets int64 (B,) from batched observations and uniforms float64 (B,) in [0, 1)."""
+
+    def decide(self, simulator: TurnSimulator) -> np.ndarray:
+        """Observe for every acting agent under the simulator's view, then choose."""
+        agents = simulator.acting
+        return self.choose(simulator.observe(agents), simulator.policy_noise(agents))
+
+    def act(self, observation: Mapping[str, np.ndarray], uniform: float = 0.5) -> int:
+        """One agent's choice from its own observation without batch axis, as PettingZoo gives it.
+
+        Accepts the face's `{"observation": ..., "action_mask": ...}` or the flat dict. `uniform` in [0, 1)
+        picks by inverse distribution; greedy schedulers ignore it.
+        """
+        flat: dict[str, np.ndarray] = dict(observation.get("observation", observation))
+        if ACTION_MASK not in flat:
+            flat[ACTION_MASK] = observation[ACTION_MASK]
+        batched = {name: np.asarray(value)[None] for name, value in flat.items()}
+        return int(self.choose(batched, np.array([uniform]))[0])
+
+
+def best_target(score: np.ndarray, eligible: np.ndarray) -> np.ndarray:
+    """The eligible target with the highest score, ties to the lowest index, 0 where none is eligible.
+
+    score float64 (B, n_targets), eligible bool (B, n_targets); returns int64 (B,).
+    """
+    masked = np.where(eligible, score, -np.inf)
+    best = masked.argmax(axis=1)
+    return np.where(eligible.any(axis=1), best, 0).astype(np.int64)
