@@ -1,0 +1,1 @@
+"""Who decides: heuristics, exact solvers and learned policies, all of them schedulers."""

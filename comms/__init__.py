@@ -1,0 +1,1 @@
+"""How decisions travel: messages, the world process, agent processes and the launcher."""

@@ -1,0 +1,1 @@
+"""One folder per scheduling domain, and the faces that every domain gets for free."""

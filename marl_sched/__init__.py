@@ -1,0 +1,42 @@
+"""Schedulers that decide for themselves: failure-predictive aircraft maintenance (AirME) as a multi-agent problem.
+
+    from marl_sched import airme_v0
+
+    env = airme_v0.env()                                    # PettingZoo AEC
+    policy = marl_sched.load_policy("airme-local-profit")   # needs torch, the environments do not
+
+Importing this package imports nothing else; each name is loaded when it is first used.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from marl_sched import airme_v0 as airme_v0
+    from marl_sched.agents import load_policy as load_policy
+
+    __version__: str
+
+_MODULES = ("airme_v0",)
+_ATTRIBUTES = {"load_policy": "marl_sched.agents"}
+
+__all__ = ["__version__", "airme_v0", "load_policy"]
+
+
+def __getattr__(name: str) -> Any:
+    """The public names, imported on first use (PEP 562)."""
+    if name in _MODULES:
+        return import_module(f"marl_sched.{name}")
+    if name in _ATTRIBUTES:
+        return getattr(import_module(_ATTRIBUTES[name]), name)
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("marl-sched")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(set(globals()) | set(__all__))

@@ -1,0 +1,11 @@
+"""Finds the packages: `marl_sched`, and the rooms beside it as its sub-packages (the rest is in pyproject.toml)."""
+
+from setuptools import find_packages, setup
+
+ROOMS = ("envs", "agents", "train", "comms", "configs")
+
+packages = find_packages(include=["marl_sched", "marl_sched.*"])
+for room in ROOMS:
+    packages += [f"marl_sched.{package}" for package in find_packages(include=[room, f"{room}.*"])]
+
+setup(packages=packages, package_dir={f"marl_sched.{room}": room for room in ROOMS})

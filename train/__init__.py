@@ -1,0 +1,1 @@
+"""How policies learn, and how they are evaluated and compared."""
