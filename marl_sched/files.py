@@ -47,4 +47,5 @@ def read_json(path: str | Path) -> Any:
     except UnicodeDecodeError as error:
         raise InvalidFileError(path, f"byte {error.start}", "UTF-8 text") from error
     except json.JSONDecodeError as error:
-        raise InvalidFileError(path, f"line {error.lineno} column {error.colno}", f"valid JSON ({error.msg})") from error
+        where = f"line {error.lineno} column {error.colno}"
+        raise InvalidFileError(path, where, f"valid JSON ({error.msg})") from error

@@ -1,0 +1,51 @@
+# The two commands of the README are `make demo` and `make test`. They need Python 3.11 or newer and make.
+
+PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
+	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
+BIN := .venv/bin
+INSTALLED := .venv/.installed
+WHEEL_VENV := build/wheel-venv
+PYTEST_ARGS ?=
+
+.PHONY: demo test unit wheel lint format clean
+
+demo: $(INSTALLED) ## seven crews as processes for thirty days, compared with central schedulers; writes out/demo/
+	$(BIN)/marl-sched demo
+
+test: unit wheel ## all tests, then the wheel in a second environment
+
+unit: $(INSTALLED)
+	rm -rf build/numba # an edited kernel in another file would not be noticed by Numba's cache
+	NUMBA_CACHE_DIR=$(CURDIR)/build/numba OMP_NUM_THREADS=1 $(BIN)/pytest $(PYTEST_ARGS)
+
+# The second environment borrows the dependencies of the first through a .pth file; the editable install does not
+# come along, since .pth files are not read from there. The wheel must do without the checkout.
+wheel: $(INSTALLED)
+	rm -rf build
+	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir build/wheel .
+	$(BIN)/python -m venv --without-pip $(WHEEL_VENV)
+	$(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))' \
+		> "$$($(WHEEL_VENV)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/dependencies.pth"
+	$(BIN)/python -m pip --python $(WHEEL_VENV) install --quiet --no-deps --no-index build/wheel/*.whl
+	cd $(WHEEL_VENV) && bin/marl-sched --version && bin/marl-sched list
+
+# Types are checked where the package is whole: installed. From the root mypy would see the core alone.
+lint: $(INSTALLED) ## style, formatting, types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	rm -rf build
+	$(BIN)/python -m pip install --quiet --no-deps --target build/typecheck .
+	cd build/typecheck && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache -p marl_sched
+
+format: $(INSTALLED) ## sort imports and lay out the code
+	$(BIN)/ruff check --select I --fix .
+	$(BIN)/ruff format .
+
+clean: ## remove everything that these commands made, results in out/ excepted
+	rm -rf .venv build dist .mypy_cache .pytest_cache .ruff_cache *.egg-info
+
+$(INSTALLED): pyproject.toml setup.py constraints.txt
+	@test -n "$(PYTHON)" || { echo "marl_sched needs Python 3.11 or newer: make PYTHON=/path/to/python" >&2; exit 2; }
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[all,test]'
+	touch $@
