@@ -1,1 +1,3 @@
 """One folder per scheduling domain, and the faces that every domain gets for free."""
+
+from marl_sched.envs.airme import domain as _airme  # noqa: F401  (registers the domain)

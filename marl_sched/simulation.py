@@ -27,7 +27,7 @@ class TurnSimulator(ABC):
         batch: number of rows.
         max_agents, max_targets: padded sizes; targets are 0..max_targets-1.
         n_agents: int64 (B,), agents of each row's instance.
-        acting: int64 (B,), the agent to act, -1 where the episode is over.
+        acting: int64 (B,), the agent to act, -1 where nobody is to act because the episode is over.
         time: int64 (B,), simulated time (AirME: hours, MuRSE: time units).
         reward: float64 (B,), team reward of the time the last step let pass; 0 while others act at the moment.
         elapsed: int64 (B,), simulated time that the last step let pass.
@@ -55,12 +55,18 @@ class TurnSimulator(ABC):
 
     @abstractmethod
     def reset(
-        self, rows: np.ndarray | None = None, *, seed: int | None = None, instances: Sequence[Any] | None = None
+        self,
+        rows: np.ndarray | None = None,
+        *,
+        seed: int | None = None,
+        instances: Sequence[Any] | None = None,
+        episodes: Sequence[int] | None = None,
     ) -> None:
         """Start a new episode in `rows` (bool (B,), all if None).
 
-        With a seed the rows start episode 0 of that seed, without one the next episode of theirs.
-        `instances`, one for each chosen row in order, replace the rows' instances.
+        With a seed the rows start episode 0 of that seed, without one the next episode of theirs; `episodes`,
+        one number for each chosen row in order, says otherwise (rows that share an instance need it).
+        `instances`, likewise, replace the rows' instances.
         """
 
     @abstractmethod
@@ -111,4 +117,4 @@ class TurnSimulator(ABC):
     @property
     def over(self) -> np.ndarray:
         """Bool (B,), rows whose episode has ended."""
-        return self.acting < 0
+        return self.terminated | self.truncated

@@ -1,0 +1,40 @@
+"""AirME's centralised interface: every hour one decision for each crew (dissertation, section 6.2.4)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from gymnasium import spaces
+
+if TYPE_CHECKING:
+    from marl_sched.envs.airme.simulator import AirmeSimulator
+
+
+class HourlyDecisions:
+    """A joint action is a target for each crew, int64 (C,); one step is one hour.
+
+    Targets of busy crews are ignored. A plane that is in somebody's hands, chosen by a lower crew this hour or
+    not of this fleet idles its crew, whose index the step's infos list under `illegal`.
+    """
+
+    def action_space(self, simulator: AirmeSimulator) -> spaces.MultiDiscrete:
+        """`MultiDiscrete([P + 1] * C)`, padded like the simulator."""
+        return spaces.MultiDiscrete(np.full(simulator.max_agents, simulator.max_targets))
+
+    def play(self, simulator: AirmeSimulator, action: Any) -> tuple[float, dict[str, Any]]:
+        """Play one hour of row 0; the reward of the hour, and which crews idled for an impossible target."""
+        choices = np.asarray(action, np.int64)
+        free = simulator.free_agents(0)
+        planes = simulator.state.planes[0]
+        taken: set[int] = set()
+        illegal = []
+        for crew in free:
+            target = int(choices[crew])
+            if target == 0:
+                continue
+            if target > simulator.state.rows["n_planes"][0] or planes["crew"][target] >= 0 or target in taken:
+                illegal.append(int(crew))
+            taken.add(target)
+        simulator.play_hour(choices[None])
+        return float(simulator.reward[0]), {"illegal": illegal}

@@ -1,0 +1,29 @@
+"""AirME as the rooms see it."""
+
+from __future__ import annotations
+
+from marl_sched.domain import Domain, register
+from marl_sched.envs.airme import render
+from marl_sched.envs.airme.central import HourlyDecisions
+from marl_sched.envs.airme.dynamics import OBJECTIVES
+from marl_sched.envs.airme.instance import SCALES, AirmeInstance, generate, load
+from marl_sched.envs.airme.simulator import DEFAULT_HORIZON, AirmeSimulator
+from marl_sched.envs.airme.views import VIEWS
+
+AIRME = register(
+    Domain(
+        name="airme",
+        title="maintenance crews serve a fleet of aircraft whose parts fail by chance",
+        scales=SCALES,
+        objectives=OBJECTIVES,
+        views=VIEWS,
+        agent_prefix="crew",
+        generate=generate,
+        load=load,
+        instance_type=AirmeInstance,
+        simulator=AirmeSimulator,
+        central=HourlyDecisions(),
+        render={"ansi": render.fleet_board, "rgb_array": render.timeline},
+        default_horizon=DEFAULT_HORIZON,
+    )
+)

@@ -1,0 +1,351 @@
+"""The AirME simulator as compiled kernels over plain arrays (dissertation, section 6.2).
+
+Slot 0 of `planes` is the null plane, slots 1..n_planes are the fleet, so a target is a slot. Everything is
+integer hours and float64 money. The order of events within an hour and the facts that the dissertation
+leaves open are written beside the lines that implement them.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from marl_sched.noise import FIRST_DOMAIN_STREAM, integer, moment_key, uniform
+
+PLANE = np.dtype(
+    [
+        ("income", np.float64),  # per flying hour
+        ("job_cost", np.float64),  # per hour of the running repair
+        ("hours", np.int32),  # operating hours since the last repair
+        ("landings", np.int32),
+        ("kind", np.int32),  # index of the aircraft type
+        ("crew", np.int32),  # who repairs it, -1: nobody
+        ("job_hours", np.int32),  # length of the running repair
+        ("job_done", np.int32),
+        ("mission_hours", np.int32),  # length of the running mission, 0: grounded
+        ("mission_done", np.int32),
+        ("chosen", np.int32),  # the crew that chose it this hour, -1: none
+        ("broken", np.bool_),
+    ],
+    align=True,
+)
+CREW = np.dtype(
+    [
+        ("plane", np.int32),  # the slot under repair, 0: free
+        ("job_hours", np.int32),
+        ("job_done", np.int32),
+        ("choice", np.int32),  # this hour's target, IDLE or UNDECIDED
+    ],
+    align=True,
+)
+ROW = np.dtype(
+    [
+        ("n_planes", np.int64),
+        ("n_crews", np.int64),
+        ("total_income", np.float64),  # of all planes, what profit and revenue are divided by
+        ("episode", np.uint64),  # key of the noise
+        ("time", np.int64),  # hours
+        ("acting", np.int64),  # the crew to act, -1: nobody
+        ("reward", np.float64),
+        ("elapsed", np.int64),
+        ("sums", np.float64, (3,)),  # objectives summed over the hours so far
+        ("conflict", np.bool_),
+        ("terminated", np.bool_),
+        ("truncated", np.bool_),
+    ],
+    align=True,
+)
+
+REPAIR_HOURS = (2, 8)
+HOURS_PER_REPAIR_HOUR = 24
+LANDINGS_PER_REPAIR_HOUR = 6
+BROKEN_REPAIR_HOURS = 12
+COST_SHARE_OF_INCOME = (0.1, 1.0)
+LABOUR_COST = 2.0  # per hour
+BROKEN_COST = 48.0
+MISSION_HOURS = (5, 10)
+
+IDLE, UNDECIDED = 0, -1
+PROFIT, REVENUE, AVAILABILITY = 0, 1, 2
+OBJECTIVES = ("profit", "revenue", "availability")
+FULL, SKIP, SINGLE = 0, 1, 2
+SCHEMES = ("full", "skip", "single")
+# What a plane does in an hour, for timelines.
+GROUNDED, FLYING, BROKEN, REPAIR = 0, 1, 2, 3
+
+
+class State(NamedTuple):
+    """Everything that changes, one row per instance: B rows, P planes, C crews, T hours, H hours of staleness."""
+
+    rows: np.ndarray  # ROW (B,)
+    planes: np.ndarray  # PLANE (B, P + 1)
+    crews: np.ndarray  # CREW (B, C)
+    series: np.ndarray  # float64 (B, T, 3), objectives of each hour
+    timeline: np.ndarray  # uint8 (B, T, P + 1), what each plane did, or (0, 0, 0): not recorded
+    past: np.ndarray  # PLANE (B, H + 1, P + 1), planes at the start of hour t in slot t mod (H + 1); H = 0: (B, 0, P + 1)
+    told: np.ndarray  # PLANE (B, C, P + 1), statuses that a crew learnt by itself; H = 0: (0, 0, 0)
+    told_at: np.ndarray  # int64 (B, C, P + 1), hour of that status, -1: never; H = 0: (0, 0, 0)
+
+
+class Rules(NamedTuple):
+    """What stays the same over an episode."""
+
+    usage: np.ndarray  # float64 (n_types,), probability of starting a mission
+    failure: np.ndarray  # float64 (n_types, parts, longest + 1), see aircraft.failure_table
+    objective: int  # PROFIT, REVENUE or AVAILABILITY
+    scheme: int  # FULL, SKIP or SINGLE, section 6.3.1
+    horizon: int  # hours
+    stop_share: float  # the episode ends when this share of planes is broken, 0: never
+
+
+class Stream(IntEnum):
+    """Streams of AirME's noise; the entity is always the plane's slot."""
+
+    REPAIR_HOURS = FIRST_DOMAIN_STREAM
+    REPAIR_COST = FIRST_DOMAIN_STREAM + 1
+    MISSION = FIRST_DOMAIN_STREAM + 2
+    MISSION_HOURS = FIRST_DOMAIN_STREAM + 3
+    FAILURE = FIRST_DOMAIN_STREAM + 4  # draw = part
+
+
+_REPAIR_HOURS, _REPAIR_COST = int(Stream.REPAIR_HOURS), int(Stream.REPAIR_COST)
+_MISSION, _MISSION_HOURS, _FAILURE = int(Stream.MISSION), int(Stream.MISSION_HOURS), int(Stream.FAILURE)
+
+
+@njit(cache=True, inline="always")
+def start_repair(plane, slot, crew, moment):
+    """Send a crew to a plane: draw the job's hours, then its cost; a running mission ends without a landing."""
+    hours = integer(uniform(moment, _REPAIR_HOURS, slot, 0), REPAIR_HOURS[0], REPAIR_HOURS[1])
+    hours += plane.hours // HOURS_PER_REPAIR_HOUR + plane.landings // LANDINGS_PER_REPAIR_HOUR
+    low, high = COST_SHARE_OF_INCOME
+    cost = (low + (high - low) * uniform(moment, _REPAIR_COST, slot, 0)) * plane.income
+    if plane.broken:
+        hours += BROKEN_REPAIR_HOURS
+        cost += BROKEN_COST
+    cost += LABOUR_COST * hours
+    plane.crew = crew
+    plane.job_hours = hours
+    plane.job_done = 0
+    plane.job_cost = cost / hours
+    plane.mission_hours = 0
+    plane.mission_done = 0
+
+
+@njit(cache=True, inline="always")
+def fails(plane, slot, failure, moment):
+    """Whether a part of a flying plane fails this hour, on the counters as they stood before the hour (eq. 6.1)."""
+    for part in range(failure.shape[1]):
+        usage = plane.landings if part == 0 else plane.hours
+        probability = failure[plane.kind, part, usage]
+        if probability > 0.0 and uniform(moment, _FAILURE, slot, part) < probability:
+            return True
+    return False
+
+
+@njit(cache=True, inline="always")
+def fly(plane, slot, usage, failure, moment):
+    """A plane's hour outside repair: it may start a mission, and while it flies it may fail."""
+    if plane.broken:
+        return
+    if plane.mission_hours == 0 and uniform(moment, _MISSION, slot, 0) < usage[plane.kind]:
+        plane.mission_hours = integer(uniform(moment, _MISSION_HOURS, slot, 0), MISSION_HOURS[0], MISSION_HOURS[1])
+        plane.mission_done = 0
+    if plane.mission_hours == 0:
+        return
+    if fails(plane, slot, failure, moment):
+        plane.broken = True  # counters stand still until the repair, and the mission ends without a landing
+        plane.mission_hours = 0
+        plane.mission_done = 0
+    else:
+        plane.hours += 1
+        plane.mission_done += 1
+
+
+@njit(cache=True, inline="always")
+def release(plane, crews):
+    """End of the hour: a finished repair makes the plane new and the crew free, a finished mission lands."""
+    if plane.crew >= 0:
+        if plane.job_done >= plane.job_hours:
+            crews[plane.crew].plane = 0
+            crews[plane.crew].job_hours = 0
+            crews[plane.crew].job_done = 0
+            plane.crew = -1
+            plane.job_hours = 0
+            plane.job_done = 0
+            plane.job_cost = 0.0
+            plane.hours = 0
+            plane.landings = 0
+            plane.broken = False
+    elif plane.mission_hours > 0 and plane.mission_done >= plane.mission_hours:
+        plane.landings += 1
+        plane.mission_hours = 0
+        plane.mission_done = 0
+
+
+@njit(cache=True)
+def hour(row, planes, crews, usage, failure, status):
+    """One hour of one instance; returns (income, repair cost, planes available, planes broken).
+
+    row ROW, planes PLANE (P + 1,), crews CREW (C,) with their choices, usage float64 (n_types,), failure
+    float64 (n_types, parts, longest + 1), status uint8 (P + 1,) or (0,): what each plane did. Decisions apply
+    first and their hour is the first hour of repair.
+    """
+    moment = moment_key(row.episode, row.time)
+    for crew in range(row.n_crews):
+        target = crews[crew].choice
+        crews[crew].choice = UNDECIDED
+        if target > 0:
+            start_repair(planes[target], target, crew, moment)
+            crews[crew].plane = target
+            crews[crew].job_hours = planes[target].job_hours
+            crews[crew].job_done = 0
+    income = 0.0
+    cost = 0.0
+    available = 0
+    broken = 0
+    for slot in range(1, row.n_planes + 1):
+        plane = planes[slot]
+        plane.chosen = -1
+        if plane.crew >= 0:
+            plane.job_done += 1
+            crews[plane.crew].job_done = plane.job_done
+            cost += plane.job_cost
+        else:
+            fly(plane, slot, usage, failure, moment)
+            if plane.mission_hours > 0:
+                income += plane.income
+            if not plane.broken:
+                available += 1
+        if status.shape[0] > 0:
+            status[slot] = _status(plane)
+        release(plane, crews)
+        if plane.broken:
+            broken += 1
+    return income, cost, available, broken
+
+
+@njit(cache=True, inline="always")
+def _status(plane):
+    if plane.crew >= 0:
+        return REPAIR
+    if plane.broken:
+        return BROKEN
+    return FLYING if plane.mission_hours > 0 else GROUNDED
+
+
+@njit(cache=True, inline="always")
+def next_free(crews, n_crews, first):
+    """The lowest crew from `first` on that is free and undecided, -1 if there is none."""
+    for crew in range(first, n_crews):
+        if crews[crew].plane == 0 and crews[crew].choice == UNDECIDED:
+            return crew
+    return -1
+
+
+@njit(cache=True)
+def decide(state, b, crew, target):
+    """Note a crew's choice in row b; one that is impossible in truth idles the crew for this hour."""
+    row, planes = state.rows[b], state.planes[b]
+    if target == IDLE:
+        state.crews[b, crew].choice = IDLE
+    elif target <= row.n_planes and planes[target].crew < 0 and planes[target].chosen < 0:
+        state.crews[b, crew].choice = target
+        planes[target].chosen = crew
+    else:
+        row.conflict = True
+        state.crews[b, crew].choice = IDLE
+        if target <= row.n_planes and state.told_at.shape[0] > 0:
+            state.told[b, crew, target] = planes[target]
+            state.told_at[b, crew, target] = row.time
+
+
+@njit(cache=True)
+def pass_hour(state, rules, b):
+    """Let one hour pass in row b, keep the books, and see whether the episode ends."""
+    row, t = state.rows[b], state.rows[b].time
+    status = state.timeline[b, t] if state.timeline.shape[0] > 0 else np.empty(0, np.uint8)
+    income, cost, available, broken = hour(row, state.planes[b], state.crews[b], rules.usage, rules.failure, status)
+    series = state.series[b, t]
+    series[PROFIT] = (income - cost) / row.total_income
+    series[REVENUE] = income / row.total_income
+    series[AVAILABILITY] = available / row.n_planes
+    for k in range(3):
+        row.sums[k] += series[k]
+    row.reward += series[rules.objective]
+    row.elapsed += 1
+    row.time = t + 1
+    if state.past.shape[1] > 0:
+        state.past[b, (t + 1) % state.past.shape[1]] = state.planes[b]
+    if rules.stop_share > 0.0 and broken >= rules.stop_share * row.n_planes:
+        row.terminated = True
+    elif t + 1 >= rules.horizon:
+        row.truncated = True
+
+
+@njit(cache=True)
+def pass_hour_with_memory(state, rules, b):
+    """As `pass_hour`, for views in which crews remember: who finished a repair knows the plane as it left it."""
+    row, crews = state.rows[b], state.crews[b]
+    jobs = np.empty(row.n_crews, np.int32)
+    for crew in range(row.n_crews):
+        jobs[crew] = max(crews[crew].plane, crews[crew].choice)
+    pass_hour(state, rules, b)
+    for crew in range(row.n_crews):
+        slot = jobs[crew]
+        if slot > 0 and crews[crew].plane == 0:
+            state.told[b, crew, slot] = state.planes[b, slot]
+            state.told_at[b, crew, slot] = row.time
+
+
+@njit(cache=True)
+def begin_step(row):
+    """Forget what the last step brought."""
+    row.reward = 0.0
+    row.elapsed = 0
+    row.conflict = False
+
+
+@njit(cache=True)
+def step(state, rules, targets):
+    """Take a turn, int64 (B,), in every row that is not over and let hours pass until a crew of it is free."""
+    for b in range(targets.shape[0]):
+        row = state.rows[b]
+        begin_step(row)
+        if row.acting < 0:
+            continue
+        decide(state, b, row.acting, targets[b])
+        ends = rules.scheme == SINGLE or (rules.scheme == SKIP and targets[b] == IDLE)
+        following = -1 if ends else next_free(state.crews[b], row.n_crews, row.acting + 1)
+        while following < 0 and not row.terminated and not row.truncated:
+            if state.told_at.shape[0] > 0:
+                pass_hour_with_memory(state, rules, b)
+            else:
+                pass_hour(state, rules, b)
+            following = next_free(state.crews[b], row.n_crews, 0)
+        row.acting = -1 if row.terminated or row.truncated else following
+
+
+@njit(cache=True)
+def play_hour(state, rules, choices):
+    """Play one hour in every row that is not over, with a target for each crew, int64 (B, C).
+
+    This is the centralised interface of section 6.2.4: targets of busy crews are ignored, impossible ones idle
+    the crew. Afterwards `acting` is the first free crew, -1 if all are busy.
+    """
+    for b in range(choices.shape[0]):
+        row = state.rows[b]
+        begin_step(row)
+        if row.terminated or row.truncated:
+            continue
+        for crew in range(row.n_crews):
+            if state.crews[b, crew].plane == 0:
+                decide(state, b, crew, choices[b, crew])
+        if state.told_at.shape[0] > 0:
+            pass_hour_with_memory(state, rules, b)
+        else:
+            pass_hour(state, rules, b)
+        over = row.terminated or row.truncated
+        row.acting = -1 if over else next_free(state.crews[b], row.n_crews, 0)

@@ -1,0 +1,225 @@
+"""An AirME state as the heterogeneous graph that one crew sees (dissertation, section 6.3.2 and figure 6.2).
+
+Plane slot 0 is the null plane. The state node holds shares and ratios of what is visible, never raw counts,
+so that a policy meets the same range of values at every scale.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from marl_sched.envs.airme.dynamics import UNDECIDED, State
+from marl_sched.envs.airme.views import EVERYWHERE, home_sector, ring_distance
+from marl_sched.graph import GraphSpec, NodeType, Relation
+
+_PLANE = (
+    "hours/10", "usage_probability", "landings/5", "broken", "income/10", "free", "in_repair", "chosen_this_hour",
+    "job_hours/10", "job_cost_per_hour/10", "job_done/10", "flying", "mission_hours/10", "mission_done/10",
+    "age_hours/10", "null_plane",
+)  # fmt: skip
+_CREW = ("free", "busy", "chose_this_hour", "acting", "job_hours/10", "job_done/10")
+_STATE = (
+    "free_share", "broken_share", "in_repair_share", "flying_share", "planes_per_crew/10", "free_crews_share",
+    "mean_hours/100", "mean_landings/10", "mean_income/10",
+)  # fmt: skip
+TENTH, FIFTH, HALF = np.float32(0.1), np.float32(0.2), np.float32(0.5)
+N_PLANE, N_CREW, N_STATE = len(_PLANE), len(_CREW), len(_STATE)
+
+
+def graph_spec(n_types: int) -> GraphSpec:
+    """The metagraph for a fleet with that many aircraft types, whose one-hot ends the plane's features.
+
+    As the crews are alike there are no edges from crews to decisions.
+    """
+    types = tuple(f"type_{k}" for k in range(n_types))
+    shares = tuple(f"type_{k}_share" for k in range(n_types))
+    return GraphSpec(
+        nodes=(NodeType("plane", _PLANE + types), NodeType("crew", _CREW)),
+        state_features=_STATE + shares,
+        relations=(
+            Relation("crew", "repairing", "plane", "scatter", index="repairing"),
+            Relation("plane", "repaired_by", "crew", "gather", index="repairing"),
+            Relation("plane", "in", "state", "all", attention=True),
+            Relation("crew", "in", "state", "all", attention=True),
+            Relation("plane", "to", "decision", "same"),
+            Relation("state", "to", "decision", "all"),
+        ),
+        decision_of="plane",
+    )
+
+
+class Arrays(NamedTuple):
+    """The arrays of an observation that the kernel writes; see marl_sched.graph for shapes."""
+
+    plane: np.ndarray
+    plane_mask: np.ndarray
+    crew: np.ndarray
+    crew_mask: np.ndarray
+    state: np.ndarray
+    repairing: np.ndarray
+    action_mask: np.ndarray
+    time: np.ndarray
+    visible_share: np.ndarray
+
+
+@njit(cache=True)
+def observe(state: State, usage, agents, reach, comm, staleness, out: Arrays):
+    """Write what each row's agent, int64 (B,), sees; a negative agent sees nothing.
+
+    `usage` float64 (n_types,). `reach`, `comm` and `staleness` are those of a LocalView, or EVERYWHERE.
+    """
+    for b in range(agents.shape[0]):
+        out.crew[b] = 0
+        out.crew_mask[b] = 0
+        out.state[b] = 0
+        out.repairing[b] = -1
+        out.action_mask[b] = 0
+        out.action_mask[b, 0] = 1
+        out.time[b] = state.rows[b].time
+        if agents[b] >= 0:
+            see_crews(state, b, agents[b], comm, out)
+            see_planes(state, usage, b, agents[b], reach, staleness, out)
+            hear_of_jobs(state, b, out)
+            offer(state, b, agents[b], out)
+            summarise(out, b, state.rows[b].n_planes)
+        else:
+            out.plane[b] = 0
+            out.plane_mask[b] = 0
+            out.visible_share[b] = 0
+
+
+@njit(cache=True)
+def see_crews(state, b, agent, comm, out):
+    """Crews within `comm`, with their present jobs."""
+    n_crews = state.rows[b].n_crews
+    for crew in range(n_crews):
+        if ring_distance(agent, crew, n_crews) > comm:
+            continue
+        record = state.crews[b, crew]
+        out.crew_mask[b, crew] = 1
+        out.crew[b, crew, 0] = record.plane == 0
+        out.crew[b, crew, 1] = record.plane > 0
+        out.crew[b, crew, 2] = record.choice != UNDECIDED
+        out.crew[b, crew, 3] = crew == agent
+        out.crew[b, crew, 4] = record.job_hours * TENTH
+        out.crew[b, crew, 5] = record.job_done * TENTH
+
+
+@njit(cache=True)
+def see_planes(state, usage, b, agent, reach, staleness, out):
+    """Planes of the sectors within `reach`, each as this crew knows it; all others are zero."""
+    row = state.rows[b]
+    n_crews, now = row.n_crews, row.time
+    pictured = max(0, now - staleness)
+    out.plane[b, 0] = 0
+    out.plane[b, 0, 15] = 1
+    out.plane_mask[b, 0] = 1
+    visible = 0
+    for slot in range(1, out.plane.shape[1]):
+        sector = home_sector(slot, n_crews)
+        if slot > row.n_planes or (reach < EVERYWHERE and ring_distance(agent, sector, n_crews) > reach):
+            out.plane_mask[b, slot] = 0
+            for k in range(out.plane.shape[2]):
+                out.plane[b, slot, k] = 0
+            continue
+        visible += 1
+        out.plane_mask[b, slot] = 1
+        if sector == agent or staleness == 0:
+            describe(state.planes[b, slot], usage, 0, out.plane, b, slot)
+        elif state.told_at[b, agent, slot] >= pictured:
+            describe(state.told[b, agent, slot], usage, now - state.told_at[b, agent, slot], out.plane, b, slot)
+        else:
+            describe(state.past[b, pictured % state.past.shape[1], slot], usage, now - pictured, out.plane, b, slot)
+    out.visible_share[b] = visible / row.n_planes
+
+
+@njit(cache=True, inline="always")
+def describe(plane, usage, age, out, b, slot):
+    """A plane's features from its record; `age` is how many hours old the picture is.
+
+    Whose choice it is this hour is not in the picture: that is heard from crews within `comm`. A told status
+    says so nevertheless, as somebody has the plane in hand.
+    """
+    in_hand = plane.crew >= 0 or (age > 0 and plane.chosen >= 0)
+    out[b, slot, 0] = plane.hours * TENTH
+    out[b, slot, 1] = usage[plane.kind]
+    out[b, slot, 2] = plane.landings * FIFTH
+    out[b, slot, 3] = plane.broken
+    out[b, slot, 4] = plane.income * TENTH
+    out[b, slot, 5] = not in_hand
+    out[b, slot, 6] = in_hand
+    out[b, slot, 7] = 0
+    out[b, slot, 8] = plane.job_hours * TENTH
+    out[b, slot, 9] = plane.job_cost * TENTH
+    out[b, slot, 10] = plane.job_done * TENTH
+    out[b, slot, 11] = plane.mission_hours > 0
+    out[b, slot, 12] = plane.mission_hours * TENTH
+    out[b, slot, 13] = plane.mission_done * TENTH
+    out[b, slot, 14] = age * TENTH
+    out[b, slot, 15] = 0
+    for k in range(usage.shape[0]):
+        out[b, slot, N_PLANE + k] = plane.kind == k
+
+
+@njit(cache=True)
+def hear_of_jobs(state, b, out):
+    """What a visible crew says of its own work is newer than any picture of the plane."""
+    for crew in range(state.rows[b].n_crews):
+        if out.crew_mask[b, crew] == 0:
+            continue
+        record = state.crews[b, crew]
+        slot = max(record.plane, record.choice)
+        if slot <= 0 or out.plane_mask[b, slot] == 0:
+            continue
+        out.repairing[b, crew] = slot
+        out.plane[b, slot, 5] = 0
+        if record.plane > 0:
+            out.plane[b, slot, 6] = 1
+            out.plane[b, slot, 8] = record.job_hours * TENTH
+            out.plane[b, slot, 10] = record.job_done * TENTH
+        else:
+            out.plane[b, slot, 7] = 1
+
+
+@njit(cache=True)
+def offer(state, b, agent, out):
+    """The targets that are legal as far as the crew knows: visible planes that nobody has in hand."""
+    if state.crews[b, agent].plane > 0 or state.crews[b, agent].choice != UNDECIDED:
+        return
+    for slot in range(1, state.rows[b].n_planes + 1):
+        if out.plane[b, slot, 5] == 1:
+            out.action_mask[b, slot] = 1
+
+
+@njit(cache=True)
+def summarise(out, b, n_planes):
+    """The state node's features, from visible nodes alone."""
+    n_crews = 0
+    for crew in range(out.crew.shape[1]):
+        n_crews += out.crew_mask[b, crew]
+        out.state[b, 5] += out.crew[b, crew, 0]
+    out.state[b, 5] /= n_crews
+    visible = 0
+    for slot in range(1, n_planes + 1):
+        if out.plane_mask[b, slot] == 0:
+            continue
+        visible += 1
+        out.state[b, 0] += out.plane[b, slot, 5]
+        out.state[b, 1] += out.plane[b, slot, 3]
+        out.state[b, 2] += out.plane[b, slot, 6]
+        out.state[b, 3] += out.plane[b, slot, 11]
+        out.state[b, 6] += out.plane[b, slot, 0]
+        out.state[b, 7] += out.plane[b, slot, 2]
+        out.state[b, 8] += out.plane[b, slot, 4]
+        for k in range(N_STATE, out.state.shape[1]):
+            out.state[b, k] += out.plane[b, slot, N_PLANE + k - N_STATE]
+    share = np.float32(1.0) / np.float32(max(visible, 1))
+    for k in range(out.state.shape[1]):
+        if k != 4 and k != 5:
+            out.state[b, k] *= share
+    out.state[b, 6] *= TENTH
+    out.state[b, 7] *= HALF
+    out.state[b, 4] = TENTH * visible / n_crews

@@ -1,0 +1,67 @@
+"""Pictures of a running AirME episode: a fleet board as text, and the timeline of every plane as an image."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from marl_sched.envs.airme.dynamics import BROKEN, FLYING, GROUNDED, REPAIR
+from marl_sched.errors import InvalidOptionError
+
+if TYPE_CHECKING:
+    from marl_sched.envs.airme.simulator import AirmeSimulator
+
+COLOURS = {
+    GROUNDED: (214, 219, 223),
+    FLYING: (86, 160, 211),
+    BROKEN: (203, 67, 53),
+    REPAIR: (244, 176, 64),
+}
+_CELL = 4  # pixels a plane is high
+_HOUR = 2  # pixels an hour is wide
+_BOARD_COLUMNS = 3
+
+
+def fleet_board(simulator: AirmeSimulator, row: int = 0) -> str:
+    """The fleet and the crews of one row at this hour, as text."""
+    state, n_planes, n_crews = simulator.state, simulator.state.rows["n_planes"][row], simulator.n_agents[row]
+    means = simulator.objectives()
+    head = f"hour {simulator.time[row]:>4}   " + "   ".join(f"{k} {v[row]:.3f}" for k, v in means.items())
+    cells = [_plane_cell(state.planes[row, slot], slot) for slot in range(1, n_planes + 1)]
+    height = -(-len(cells) // _BOARD_COLUMNS)
+    lines = ["   ".join(cells[i::height]) for i in range(height)]
+    crews = [_crew_cell(state.crews[row, crew], crew) for crew in range(n_crews)]
+    return "\n".join([head, *lines, "   ".join(crews)])
+
+
+def _plane_cell(plane: np.void, slot: int) -> str:
+    if plane["crew"] >= 0:
+        what = f"repair {plane['job_done']:>2}/{plane['job_hours']:<2} by crew {plane['crew']}"
+    elif plane["broken"]:
+        what = "BROKEN"
+    elif plane["mission_hours"] > 0:
+        what = f"flying {plane['mission_done']:>2}/{plane['mission_hours']:<2}"
+    else:
+        what = "grounded"
+    return f"{slot:>3} type {plane['kind']} {plane['hours']:>3} h {plane['landings']:>2} ldg  {what:<23}"
+
+
+def _crew_cell(crew: np.void, index: int) -> str:
+    return f"crew {index}: " + (f"plane {crew['plane']}" if crew["plane"] else "free")
+
+
+def timeline(simulator: AirmeSimulator, row: int = 0) -> np.ndarray:
+    """What every plane did in every hour so far, uint8 (height, width, 3): one band per plane, one column per hour.
+
+    Grey is grounded, blue flying, red broken and waiting, amber in repair. Raises InvalidOptionError if the
+    simulator was made without `record_timeline`.
+    """
+    if not len(simulator.state.timeline):
+        raise InvalidOptionError("render: the simulator was made without record_timeline=True")
+    hours, n_planes = max(int(simulator.time[row]), 1), simulator.state.rows["n_planes"][row]
+    status = simulator.state.timeline[row, :hours, 1 : n_planes + 1].T
+    palette = np.array([COLOURS[k] for k in sorted(COLOURS)], np.uint8)
+    image = palette[status].repeat(_CELL, axis=0).repeat(_HOUR, axis=1)
+    image[_CELL - 1 :: _CELL] = 255
+    return image

@@ -1,0 +1,230 @@
+"""AirME as a batched turn-based simulator: the arrays, their setting up, and the calls into the kernels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from marl_sched.envs.airme import dynamics, graph
+from marl_sched.envs.airme.aircraft import FailureModel, failure_table
+from marl_sched.envs.airme.instance import SCALES, AirmeInstance
+from marl_sched.envs.airme.views import FullView, LocalView
+from marl_sched.errors import IllegalActionError, InvalidOptionError, UnknownNameError
+from marl_sched.noise import episode_key
+from marl_sched.simulation import Observation, TurnSimulator
+
+DEFAULT_HORIZON = 720
+
+
+class AirmeSimulator(TurnSimulator):
+    """A batch of AirME instances, one per row; see TurnSimulator for the turn-taking and its attributes.
+
+    Args:
+        instances: one AirmeInstance per row, all with the same aircraft types.
+        view: what acting crews see.
+        objective: "profit", "revenue" or "availability", the reward of an hour.
+        horizon: hours of an episode, its truncation.
+        seed: of the first episode's noise.
+        pad: a scale whose largest instance sets the padding; None pads to the largest of `instances`.
+        scheme: "full", "skip" (target 0 ends the hour's decisions) or "single" (one decision an hour),
+            section 6.3.1.
+        failure: "density" as published, or "hazard".
+        stop_share: an episode terminates when this share of planes is broken; None: never.
+        record_timeline: keep what every plane did in every hour, for rendering.
+
+    Raises InvalidOptionError or UnknownNameError for options outside their domain.
+    """
+
+    def __init__(
+        self,
+        instances: Sequence[AirmeInstance],
+        *,
+        view: FullView | LocalView | None = None,
+        objective: str = "profit",
+        horizon: int = DEFAULT_HORIZON,
+        seed: int = 0,
+        pad: str | None = None,
+        scheme: str = "full",
+        failure: FailureModel = "density",
+        stop_share: float | None = None,
+        record_timeline: bool = False,
+    ) -> None:
+        self._check(instances, objective, horizon, pad, scheme, stop_share)
+        self.instances = list(instances)
+        self.types = self.instances[0].types
+        self.view = view if view is not None else FullView()
+        self.objective, self.scheme, self.horizon, self.failure = objective, scheme, horizon, failure
+        self._limits = self.view.limits
+        self.batch = len(self.instances)
+        planes = SCALES[pad].max_planes if pad else max(i.n_planes for i in self.instances)
+        crews = SCALES[pad].crews[1] if pad else max(i.n_crews for i in self.instances)
+        self.max_targets, self.max_agents = planes + 1, crews
+        self.graph = graph.graph_spec(len(self.types))
+        self.arrays = self.graph.arrays({"plane": planes + 1, "crew": crews})
+        self.state = _new_state(self.batch, planes, crews, horizon, self._limits[2], record_timeline)
+        self.rules = dynamics.Rules(
+            usage=np.array([kind.usage for kind in self.types]),
+            failure=np.zeros((len(self.types), 1, 0)),
+            objective=dynamics.OBJECTIVES.index(objective),
+            scheme=dynamics.SCHEMES.index(scheme),
+            horizon=horizon,
+            stop_share=stop_share or 0.0,
+        )
+        self._expose()
+        self._seeds = np.full(self.batch, seed, np.int64)
+        self._episodes = np.full(self.batch, -1, np.int64)
+        self.reset(seed=seed)
+
+    @staticmethod
+    def _check(instances, objective, horizon, pad, scheme, stop_share) -> None:  # type: ignore[no-untyped-def]
+        if not instances:
+            raise InvalidOptionError("instances: expected at least one")
+        for name, value, known in (
+            ("objective of airme", objective, dynamics.OBJECTIVES),
+            ("scheme", scheme, dynamics.SCHEMES),
+            *((("scale of airme", pad, SCALES),) if pad else ()),
+        ):
+            if value not in known:
+                raise UnknownNameError(name, value, known)
+        if horizon < 1:
+            raise InvalidOptionError(f"horizon: expected at least 1 hour, got {horizon}")
+        if stop_share is not None and not 0 < stop_share <= 1:
+            raise InvalidOptionError(f"stop_share: expected a share in (0, 1] or None, got {stop_share}")
+
+    def _expose(self) -> None:
+        rows = self.state.rows
+        self.n_agents, self.acting, self.time = rows["n_crews"], rows["acting"], rows["time"]
+        self.reward, self.elapsed, self.conflict = rows["reward"], rows["elapsed"], rows["conflict"]
+        self.terminated, self.truncated = rows["terminated"], rows["truncated"]
+        self.episode_keys = rows["episode"]
+
+    def reset(
+        self,
+        rows: np.ndarray | None = None,
+        *,
+        seed: int | None = None,
+        instances: Sequence[AirmeInstance] | None = None,
+        episodes: Sequence[int] | None = None,
+    ) -> None:
+        """Start new episodes; see TurnSimulator.reset."""
+        chosen = np.arange(self.batch) if rows is None else np.flatnonzero(rows)
+        for name, given in (("instances", instances), ("episodes", episodes)):
+            if given is not None and len(given) != len(chosen):
+                raise InvalidOptionError(f"{name}: expected one per chosen row ({len(chosen)}), got {len(given)}")
+        if instances is not None:
+            for b, instance in zip(chosen, instances, strict=True):
+                self.instances[b] = instance
+        self._cover_counters()
+        if seed is not None:
+            self._seeds[chosen] = seed
+            self._episodes[chosen] = 0
+        else:
+            self._episodes[chosen] += 1
+        if episodes is not None:
+            self._episodes[chosen] = episodes
+        for b in chosen:
+            self._start(int(b))
+
+    def _cover_counters(self) -> None:
+        """Make the failure table reach every counter that an episode can reach."""
+        longest = max(int(max(i.hours.max(), i.landings.max())) for i in self.instances) + self.horizon
+        if self.rules.failure.shape[2] <= longest:
+            table = failure_table(self.types, longest, self.failure)
+            self.rules = self.rules._replace(failure=table)
+
+    def _start(self, b: int) -> None:
+        instance, state = self.instances[b], self.state
+        if instance.types != self.types:
+            raise InvalidOptionError(f"instances[{b}]: aircraft types differ from those of the other rows")
+        n_planes, n_crews = instance.n_planes, instance.n_crews
+        if n_planes >= self.max_targets or n_crews > self.max_agents:
+            raise InvalidOptionError(
+                f"instances[{b}]: {n_planes} planes and {n_crews} crews exceed the padding of "
+                f"{self.max_targets - 1} planes and {self.max_agents} crews"
+            )
+        planes = state.planes[b]
+        planes[:] = 0
+        planes["crew"] = planes["chosen"] = -1
+        for name in ("kind", "income", "hours", "landings", "broken"):
+            planes[name][1 : n_planes + 1] = getattr(instance, name)
+        state.crews[b] = 0
+        state.crews["choice"][b] = dynamics.UNDECIDED
+        state.rows[b] = 0
+        row = state.rows[b]
+        row["n_planes"], row["n_crews"] = n_planes, n_crews
+        row["total_income"] = instance.income.sum()
+        row["episode"] = episode_key(
+            np.uint64(self._seeds[b]), np.uint64(instance.identity), np.uint64(self._episodes[b])
+        )
+        state.series[b] = 0.0
+        if len(state.timeline):
+            state.timeline[b] = 0
+        if state.past.shape[1]:
+            state.past[b] = planes
+        if len(state.told_at):
+            state.told_at[b] = -1
+
+    def step(self, targets: np.ndarray) -> None:
+        """Take one turn in every row; see TurnSimulator.step."""
+        dynamics.step(self.state, self.rules, self._checked(targets, (self.batch,)))
+
+    def play_hour(self, choices: np.ndarray) -> None:
+        """Play one hour in every row with a target for each crew, int64 (B, C), as in section 6.2.4.
+
+        Targets of busy crews are ignored. Afterwards `acting` is -1 in rows whose crews are all busy.
+        """
+        dynamics.play_hour(self.state, self.rules, self._checked(choices, (self.batch, self.max_agents)))
+
+    def _checked(self, targets: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+        targets = np.asarray(targets, np.int64)
+        if targets.shape != shape:
+            raise IllegalActionError(f"targets: expected shape {shape}, got {targets.shape}")
+        if targets.min() < 0 or targets.max() >= self.max_targets:
+            bad = int(targets.min()) if targets.min() < 0 else int(targets.max())
+            raise IllegalActionError(f"target {bad}: expected a plane's slot in [0, {self.max_targets - 1}]")
+        return targets
+
+    def observe(self, agents: np.ndarray, out: Observation | None = None) -> Observation:
+        """The graph each row's crew sees under the simulator's view; see TurnSimulator.observe."""
+        return self._observe(agents, self._limits, out)
+
+    def observe_all(self) -> Observation:
+        """The acting crews' graphs under the full view."""
+        return self._observe(self.acting, FullView().limits, None)
+
+    def _observe(self, agents: np.ndarray, limits: tuple[int, int, int], out: Observation | None) -> Observation:
+        out = self.new_observation() if out is None else out
+        arrays = graph.Arrays(*[out[name] for name in graph.Arrays._fields])
+        graph.observe(self.state, self.rules.usage, np.asarray(agents, np.int64), *limits, arrays)
+        return out
+
+    def free_agents(self, row: int) -> np.ndarray:
+        """Crews that have still to act in this hour."""
+        n = self.n_agents[row]
+        free = (self.state.crews["plane"][row, :n] == 0) & (self.state.crews["choice"][row, :n] == dynamics.UNDECIDED)
+        return np.flatnonzero(free) if not self.over[row] else np.empty(0, np.int64)
+
+    def objectives(self) -> dict[str, np.ndarray]:
+        """Means over the hours played, float64 (B,): profit, revenue and availability (M1 at the horizon)."""
+        hours = np.maximum(self.time, 1)
+        return {name: self.state.rows["sums"][:, k] / hours for k, name in enumerate(dynamics.OBJECTIVES)}
+
+    def snapshot(self, row: int) -> dict[str, np.ndarray]:
+        """Copies of a row's books, planes and crews."""
+        return {name: getattr(self.state, name)[row].copy() for name in ("rows", "planes", "crews")}
+
+
+def _new_state(batch: int, planes: int, crews: int, horizon: int, staleness: int, timeline: bool) -> dynamics.State:
+    slots = planes + 1
+    memory = (batch, crews, slots) if staleness else (0, 0, 0)
+    return dynamics.State(
+        rows=np.zeros(batch, dynamics.ROW),
+        planes=np.zeros((batch, slots), dynamics.PLANE),
+        crews=np.zeros((batch, crews), dynamics.CREW),
+        series=np.zeros((batch, horizon, 3)),
+        timeline=np.zeros((batch, horizon, slots) if timeline else (0, 0, 0), np.uint8),
+        past=np.zeros((batch, staleness + 1 if staleness else 0, slots), dynamics.PLANE),
+        told=np.zeros(memory, dynamics.PLANE),
+        told_at=np.full(memory, -1, np.int64),
+    )
