@@ -58,14 +58,14 @@ def episode_key(seed: int, instance: int, episode: int) -> np.uint64:
 @njit(cache=True, inline="always")
 def moment_key(episode: np.uint64, time: int) -> np.uint64:
     """The key of one moment of simulated time within an episode."""
-    return mix((episode ^ np.uint64(time)) + _GAMMA)
+    return mix((np.uint64(episode) ^ np.uint64(time)) + _GAMMA)
 
 
 @njit(cache=True, inline="always")
 def word(moment: np.uint64, stream: int, entity: int, draw: int) -> np.uint64:
     """Sixty-four random bits for one draw; `stream` < 256, `draw` < 65536, `entity` < 2**40."""
     name = (np.uint64(stream) << _S56) | (np.uint64(draw) << _S40) | np.uint64(entity)
-    return mix(moment + (name + np.uint64(1)) * _GAMMA)
+    return mix(np.uint64(moment) + (name + np.uint64(1)) * _GAMMA)
 
 
 @njit(cache=True, inline="always")

@@ -85,9 +85,9 @@ class State(NamedTuple):
     crews: np.ndarray  # CREW (B, C)
     series: np.ndarray  # float64 (B, T, 3), objectives of each hour
     timeline: np.ndarray  # uint8 (B, T, P + 1), what each plane did, or (0, 0, 0): not recorded
-    past: np.ndarray  # PLANE (B, H + 1, P + 1), planes at the start of hour t in slot t mod (H + 1); H = 0: (B, 0, P + 1)
-    told: np.ndarray  # PLANE (B, C, P + 1), statuses that a crew learnt by itself; H = 0: (0, 0, 0)
-    told_at: np.ndarray  # int64 (B, C, P + 1), hour of that status, -1: never; H = 0: (0, 0, 0)
+    past: np.ndarray  # PLANE (B, H + 1, P + 1), planes at the start of hour t in slot t mod (H + 1), or (B, 0, P + 1)
+    told: np.ndarray  # PLANE (B, C, P + 1), statuses that a crew learnt by itself, or (0, 0, 0)
+    told_at: np.ndarray  # int64 (B, C, P + 1), hour of that status, -1: never, or (0, 0, 0)
 
 
 class Rules(NamedTuple):
