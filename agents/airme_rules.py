@@ -106,9 +106,7 @@ def condition(threshold: float = _HOURS_THRESHOLD) -> PriorityRule:
     return PriorityRule("condition", priority)
 
 
-def model_based(
-    threshold: float = _FAILURE_THRESHOLD, types: Sequence[AircraftType] = PUBLISHED_TYPES
-) -> PriorityRule:
+def model_based(threshold: float = _FAILURE_THRESHOLD, types: Sequence[AircraftType] = PUBLISHED_TYPES) -> PriorityRule:
     """Broken planes by income, then unbroken ones by their true failure probability of an hour flown now."""
 
     def priority(fleet: _Fleet) -> np.ndarray:
@@ -124,9 +122,7 @@ def model_based(
     return PriorityRule("model-based", priority, needs="failure model")
 
 
-def preventive_first(
-    hours: float = _PREVENTIVE_HOURS, landings: float = _PREVENTIVE_LANDINGS
-) -> PriorityRule:
+def preventive_first(hours: float = _PREVENTIVE_HOURS, landings: float = _PREVENTIVE_LANDINGS) -> PriorityRule:
     """Worn planes before broken ones: it keeps the backlog of long repairs from eating the crews.
 
     Fixed-wing planes (type 0) from `hours` operating hours and helicopters (type 1) from `landings` landings on

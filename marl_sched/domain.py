@@ -6,14 +6,14 @@ A third domain costs one folder that builds a `Domain` and calls `register`, and
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from marl_sched.errors import UnknownNameError
+from marl_sched.errors import require
 
 if TYPE_CHECKING:
     from gymnasium.spaces import Space
@@ -35,10 +35,10 @@ class Instance(Protocol):
 class CentralFace(Protocol):
     """How the centralised Gymnasium face speaks: one action decides for the whole team."""
 
-    def action_space(self, simulator: TurnSimulator) -> Space:
+    def action_space(self, simulator: Any) -> Space[Any]:
         """The space of a joint action."""
 
-    def play(self, simulator: TurnSimulator, action: Any) -> tuple[float, dict[str, Any]]:
+    def play(self, simulator: Any, action: Any) -> tuple[float, dict[str, Any]]:
         """Take all turns that a joint action covers in row 0; the reward it brought and the step's infos."""
 
 
@@ -88,7 +88,7 @@ class Domain:
     instance_type: type
     simulator: Callable[..., TurnSimulator]
     central: CentralFace
-    render: Mapping[str, Callable[[TurnSimulator, int], Any]]
+    render: Mapping[str, Callable[[Any, int], Any]]
     default_horizon: int
     extras: Mapping[str, Any] = field(default_factory=dict)
 
@@ -103,11 +103,11 @@ class Domain:
 
     def require_scale(self, scale: str) -> str:
         """The scale's name, or UnknownNameError."""
-        return _require(f"scale of {self.name}", scale, self.scales)
+        return require(f"scale of {self.name}", scale, self.scales)
 
     def require_objective(self, objective: str) -> str:
         """The objective's name, or UnknownNameError."""
-        return _require(f"objective of {self.name}", objective, self.objectives)
+        return require(f"objective of {self.name}", objective, self.objectives)
 
 
 _DOMAINS: dict[str, Domain] = {}
@@ -125,7 +125,7 @@ def get_domain(name: str) -> Domain:
     """The domain of that name, or UnknownNameError that lists the known ones."""
     import marl_sched.envs  # noqa: F401  (registers the domains that ship with the package)
 
-    _require("environment", name, _DOMAINS)
+    require("environment", name, _DOMAINS)
     return _DOMAINS[name]
 
 
@@ -134,9 +134,3 @@ def domain_names() -> list[str]:
     import marl_sched.envs  # noqa: F401
 
     return sorted(_DOMAINS)
-
-
-def _require(what: str, name: str, known: Iterable[str]) -> str:
-    if name not in known:
-        raise UnknownNameError(what, name, known)
-    return name

@@ -47,6 +47,14 @@ class DeploymentError(MarlSchedError, RuntimeError):
     """A distributed run that could not start or finish; the message names the process that is at fault."""
 
 
+def require(what: str, name: str, known: Iterable[str]) -> str:
+    """`name` if it is one of `known`, else UnknownNameError."""
+    names = list(known)
+    if name not in names:
+        raise UnknownNameError(what, name, names)
+    return name
+
+
 def _shorten(value: object, limit: int = 60) -> str:
     text = repr(value)
     return text if len(text) <= limit else text[: limit - 3] + "..."

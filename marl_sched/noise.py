@@ -48,7 +48,7 @@ def mix(x: np.uint64) -> np.uint64:
 
 
 @njit(cache=True)
-def episode_key(seed: int, instance: int, episode: int) -> np.uint64:
+def episode_key(seed: int | np.uint64, instance: int | np.uint64, episode: int | np.uint64) -> np.uint64:
     """The key of one episode of one instance; each argument is read as a 64-bit word."""
     key = mix(np.uint64(seed) + _GAMMA)
     key = mix((key ^ np.uint64(instance)) + _GAMMA)

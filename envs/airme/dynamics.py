@@ -8,12 +8,14 @@ leaves open are written beside the lines that implement them.
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 
 from marl_sched.noise import FIRST_DOMAIN_STREAM, integer, moment_key, uniform
+
+Record = Any  # one element of a record array, whose fields compiled code reads as attributes
 
 PLANE = np.dtype(
     [
@@ -116,7 +118,7 @@ _MISSION, _MISSION_HOURS, _FAILURE = int(Stream.MISSION), int(Stream.MISSION_HOU
 
 
 @njit(cache=True, inline="always")
-def start_repair(plane, slot, crew, moment):
+def start_repair(plane: Record, slot: int, crew: int, moment: np.uint64) -> None:
     """Send a crew to a plane: draw the job's hours, then its cost; a running mission ends without a landing."""
     hours = integer(uniform(moment, _REPAIR_HOURS, slot, 0), REPAIR_HOURS[0], REPAIR_HOURS[1])
     hours += plane.hours // HOURS_PER_REPAIR_HOUR + plane.landings // LANDINGS_PER_REPAIR_HOUR
@@ -135,7 +137,7 @@ def start_repair(plane, slot, crew, moment):
 
 
 @njit(cache=True, inline="always")
-def fails(plane, slot, failure, moment):
+def fails(plane: Record, slot: int, failure: np.ndarray, moment: np.uint64) -> bool:
     """Whether a part of a flying plane fails this hour, on the counters as they stood before the hour (eq. 6.1)."""
     for part in range(failure.shape[1]):
         usage = plane.landings if part == 0 else plane.hours
@@ -146,7 +148,7 @@ def fails(plane, slot, failure, moment):
 
 
 @njit(cache=True, inline="always")
-def fly(plane, slot, usage, failure, moment):
+def fly(plane: Record, slot: int, usage: np.ndarray, failure: np.ndarray, moment: np.uint64) -> None:
     """A plane's hour outside repair: it may start a mission, and while it flies it may fail."""
     if plane.broken:
         return
@@ -165,7 +167,7 @@ def fly(plane, slot, usage, failure, moment):
 
 
 @njit(cache=True, inline="always")
-def release(plane, crews):
+def release(plane: Record, crews: np.ndarray) -> None:
     """End of the hour: a finished repair makes the plane new and the crew free, a finished mission lands."""
     if plane.crew >= 0:
         if plane.job_done >= plane.job_hours:
@@ -186,7 +188,9 @@ def release(plane, crews):
 
 
 @njit(cache=True)
-def hour(row, planes, crews, usage, failure, status):
+def hour(
+    row: Record, planes: np.ndarray, crews: np.ndarray, usage: np.ndarray, failure: np.ndarray, status: np.ndarray
+) -> tuple[float, float, int, int]:
     """One hour of one instance; returns (income, repair cost, planes available, planes broken).
 
     row ROW, planes PLANE (P + 1,), crews CREW (C,) with their choices, usage float64 (n_types,), failure
@@ -228,7 +232,7 @@ def hour(row, planes, crews, usage, failure, status):
 
 
 @njit(cache=True, inline="always")
-def _status(plane):
+def _status(plane: Record) -> int:
     if plane.crew >= 0:
         return REPAIR
     if plane.broken:
@@ -237,7 +241,7 @@ def _status(plane):
 
 
 @njit(cache=True, inline="always")
-def next_free(crews, n_crews, first):
+def next_free(crews: np.ndarray, n_crews: int, first: int) -> int:
     """The lowest crew from `first` on that is free and undecided, -1 if there is none."""
     for crew in range(first, n_crews):
         if crews[crew].plane == 0 and crews[crew].choice == UNDECIDED:
@@ -246,7 +250,7 @@ def next_free(crews, n_crews, first):
 
 
 @njit(cache=True)
-def decide(state, b, crew, target):
+def decide(state: State, b: int, crew: int, target: int) -> None:
     """Note a crew's choice in row b; one that is impossible in truth idles the crew for this hour."""
     row, planes = state.rows[b], state.planes[b]
     if target == IDLE:
@@ -263,7 +267,7 @@ def decide(state, b, crew, target):
 
 
 @njit(cache=True)
-def pass_hour(state, rules, b):
+def pass_hour(state: State, rules: Rules, b: int) -> None:
     """Let one hour pass in row b, keep the books, and see whether the episode ends."""
     row, t = state.rows[b], state.rows[b].time
     status = state.timeline[b, t] if state.timeline.shape[0] > 0 else np.empty(0, np.uint8)
@@ -286,7 +290,7 @@ def pass_hour(state, rules, b):
 
 
 @njit(cache=True)
-def pass_hour_with_memory(state, rules, b):
+def pass_hour_with_memory(state: State, rules: Rules, b: int) -> None:
     """As `pass_hour`, for views in which crews remember: who finished a repair knows the plane as it left it."""
     row, crews = state.rows[b], state.crews[b]
     jobs = np.empty(row.n_crews, np.int32)
@@ -301,7 +305,7 @@ def pass_hour_with_memory(state, rules, b):
 
 
 @njit(cache=True)
-def begin_step(row):
+def begin_step(row: Record) -> None:
     """Forget what the last step brought."""
     row.reward = 0.0
     row.elapsed = 0
@@ -309,7 +313,7 @@ def begin_step(row):
 
 
 @njit(cache=True)
-def step(state, rules, targets):
+def step(state: State, rules: Rules, targets: np.ndarray) -> None:
     """Take a turn, int64 (B,), in every row that is not over and let hours pass until a crew of it is free."""
     for b in range(targets.shape[0]):
         row = state.rows[b]
@@ -329,7 +333,7 @@ def step(state, rules, targets):
 
 
 @njit(cache=True)
-def play_hour(state, rules, choices):
+def play_hour(state: State, rules: Rules, choices: np.ndarray) -> None:
     """Play one hour in every row that is not over, with a target for each crew, int64 (B, C).
 
     This is the centralised interface of section 6.2.4: targets of busy crews are ignored, impossible ones idle

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from marl_sched.envs.airme.dynamics import UNDECIDED, State
+from marl_sched.envs.airme.dynamics import UNDECIDED, Record, State
 from marl_sched.envs.airme.views import EVERYWHERE, home_sector, ring_distance
 from marl_sched.graph import GraphSpec, NodeType, Relation
 
@@ -66,7 +66,9 @@ class Arrays(NamedTuple):
 
 
 @njit(cache=True)
-def observe(state: State, usage, agents, reach, comm, staleness, out: Arrays):
+def observe(
+    state: State, usage: np.ndarray, agents: np.ndarray, reach: int, comm: int, staleness: int, out: Arrays
+) -> None:
     """Write what each row's agent, int64 (B,), sees; a negative agent sees nothing.
 
     `usage` float64 (n_types,). `reach`, `comm` and `staleness` are those of a LocalView, or EVERYWHERE.
@@ -92,7 +94,7 @@ def observe(state: State, usage, agents, reach, comm, staleness, out: Arrays):
 
 
 @njit(cache=True)
-def see_crews(state, b, agent, comm, out):
+def see_crews(state: State, b: int, agent: int, comm: int, out: Arrays) -> None:
     """Crews within `comm`, with their present jobs."""
     n_crews = state.rows[b].n_crews
     for crew in range(n_crews):
@@ -109,7 +111,7 @@ def see_crews(state, b, agent, comm, out):
 
 
 @njit(cache=True)
-def see_planes(state, usage, b, agent, reach, staleness, out):
+def see_planes(state: State, usage: np.ndarray, b: int, agent: int, reach: int, staleness: int, out: Arrays) -> None:
     """Planes of the sectors within `reach`, each as this crew knows it; all others are zero."""
     row = state.rows[b]
     n_crews, now = row.n_crews, row.time
@@ -137,7 +139,7 @@ def see_planes(state, usage, b, agent, reach, staleness, out):
 
 
 @njit(cache=True, inline="always")
-def describe(plane, usage, age, out, b, slot):
+def describe(plane: Record, usage: np.ndarray, age: int, out: np.ndarray, b: int, slot: int) -> None:
     """A plane's features from its record; `age` is how many hours old the picture is.
 
     Whose choice it is this hour is not in the picture: that is heard from crews within `comm`. A told status
@@ -165,7 +167,7 @@ def describe(plane, usage, age, out, b, slot):
 
 
 @njit(cache=True)
-def hear_of_jobs(state, b, out):
+def hear_of_jobs(state: State, b: int, out: Arrays) -> None:
     """What a visible crew says of its own work is newer than any picture of the plane."""
     for crew in range(state.rows[b].n_crews):
         if out.crew_mask[b, crew] == 0:
@@ -185,7 +187,7 @@ def hear_of_jobs(state, b, out):
 
 
 @njit(cache=True)
-def offer(state, b, agent, out):
+def offer(state: State, b: int, agent: int, out: Arrays) -> None:
     """The targets that are legal as far as the crew knows: visible planes that nobody has in hand."""
     if state.crews[b, agent].plane > 0 or state.crews[b, agent].choice != UNDECIDED:
         return
@@ -195,7 +197,7 @@ def offer(state, b, agent, out):
 
 
 @njit(cache=True)
-def summarise(out, b, n_planes):
+def summarise(out: Arrays, b: int, n_planes: int) -> None:
     """The state node's features, from visible nodes alone."""
     n_crews = 0
     for crew in range(out.crew.shape[1]):

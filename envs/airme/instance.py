@@ -36,7 +36,7 @@ class AirmeInstance:
     def __post_init__(self) -> None:
         """Bring the arrays to their dtypes, make them read-only, and check them."""
         for name, dtype in _ARRAYS.items():
-            array = np.array(getattr(self, name), dtype)
+            array: np.ndarray = np.array(getattr(self, name), dtype)
             array.setflags(write=False)
             object.__setattr__(self, name, array)
         problem = self._problem()

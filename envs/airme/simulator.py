@@ -10,7 +10,7 @@ from marl_sched.envs.airme import dynamics, graph
 from marl_sched.envs.airme.aircraft import FailureModel, failure_table
 from marl_sched.envs.airme.instance import SCALES, AirmeInstance
 from marl_sched.envs.airme.views import FullView, LocalView
-from marl_sched.errors import IllegalActionError, InvalidOptionError, UnknownNameError
+from marl_sched.errors import IllegalActionError, InvalidOptionError, require
 from marl_sched.noise import episode_key
 from marl_sched.simulation import Observation, TurnSimulator
 
@@ -77,16 +77,20 @@ class AirmeSimulator(TurnSimulator):
         self.reset(seed=seed)
 
     @staticmethod
-    def _check(instances, objective, horizon, pad, scheme, stop_share) -> None:  # type: ignore[no-untyped-def]
+    def _check(
+        instances: Sequence[AirmeInstance],
+        objective: str,
+        horizon: int,
+        pad: str | None,
+        scheme: str,
+        stop_share: float | None,
+    ) -> None:
         if not instances:
             raise InvalidOptionError("instances: expected at least one")
-        for name, value, known in (
-            ("objective of airme", objective, dynamics.OBJECTIVES),
-            ("scheme", scheme, dynamics.SCHEMES),
-            *((("scale of airme", pad, SCALES),) if pad else ()),
-        ):
-            if value not in known:
-                raise UnknownNameError(name, value, known)
+        require("objective of airme", objective, dynamics.OBJECTIVES)
+        require("scheme", scheme, dynamics.SCHEMES)
+        if pad is not None:
+            require("scale of airme", pad, SCALES)
         if horizon < 1:
             raise InvalidOptionError(f"horizon: expected at least 1 hour, got {horizon}")
         if stop_share is not None and not 0 < stop_share <= 1:
