@@ -1,0 +1,97 @@
+"""Reading MuRSE instances from our JSON; the field and what was expected are named in every complaint."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+import numpy as np
+
+from marl_sched.envs.murse.instance import NO_DEADLINE, SCHEMA, MurseInstance
+from marl_sched.envs.murse.learning import CURVE
+from marl_sched.errors import InvalidFileError, InvalidOptionError
+from marl_sched.files import read_json
+
+_Natural = Annotated[int, msgspec.Meta(ge=0, lt=2**31)]
+_Count = Annotated[int, msgspec.Meta(ge=1, lt=2**31)]
+_Positive = Annotated[float, msgspec.Meta(gt=0)]
+_Magnitude = Annotated[float, msgspec.Meta(ge=0)]
+
+
+class _Curve(msgspec.Struct, forbid_unknown_fields=True):
+    c: _Magnitude
+    c_std: _Magnitude
+    k: _Magnitude
+    k_std: _Magnitude
+    beta: _Magnitude
+    beta_std: _Magnitude
+
+
+class _Wait(msgspec.Struct, forbid_unknown_fields=True):
+    after: _Count
+    time: _Natural
+
+
+class _Task(msgspec.Struct, forbid_unknown_fields=True):
+    robots: list[_Natural]
+    humans: list[_Curve]
+    location: tuple[float, float]
+    deadline: _Natural | None = None
+    waits: list[_Wait] = []
+    weight: _Magnitude = 1.0
+
+
+class _File(msgspec.Struct, forbid_unknown_fields=True):
+    schema: Literal[1]
+    env: Literal["murse"]
+    n_robots: _Natural
+    n_humans: _Natural
+    tasks: Annotated[list[_Task], msgspec.Meta(min_length=1)]
+    n_rounds: _Count = 1
+    proximity: Literal["distance", "location", "none"] = "distance"
+    safety_distance: _Magnitude = 1.0
+    learning: Literal["none", "one_shot", "exponential"] = "exponential"
+    durations: Literal["deterministic", "stochastic"] = "deterministic"
+    duration_range: tuple[_Count, _Count] = (15, 100)
+    map_width: _Positive = 5.0
+
+
+def load(path: str | Path) -> MurseInstance:
+    """Read an instance; InvalidFileError names the file, the field and what was expected."""
+    data = read_json(path)
+    if isinstance(data, dict) and data.get("schema") != SCHEMA:
+        raise InvalidFileError(path, "schema", f"{SCHEMA}", data.get("schema"))
+    try:
+        file = msgspec.convert(data, _File)
+    except msgspec.ValidationError as error:
+        expected, _, field = str(error).partition(" - at `$")
+        raise InvalidFileError(path, field.rstrip("`").lstrip("."), expected.removeprefix("Expected ")) from error
+    for i, task in enumerate(file.tasks):
+        for name, count in (("robots", file.n_robots), ("humans", file.n_humans)):
+            if len(getattr(task, name)) != count:
+                raise InvalidFileError(path, f"tasks[{i}].{name}", f"{count} entries", len(getattr(task, name)))
+    try:
+        return _instance(file)
+    except InvalidOptionError as error:
+        raise InvalidFileError(path, "", f"a possible problem ({error})") from error
+
+
+def _instance(file: _File) -> MurseInstance:
+    tasks, n = file.tasks, len(file.tasks)
+    curves = [[[getattr(curve, name) for name in CURVE] for curve in task.humans] for task in tasks]
+    return MurseInstance(
+        robot_durations=np.array([task.robots for task in tasks], np.int64).reshape(n, file.n_robots),
+        curves=np.array(curves, np.float64).reshape(n, file.n_humans, len(CURVE)),
+        deadlines=np.array([NO_DEADLINE if task.deadline is None else task.deadline for task in tasks]),
+        waits=np.array([(i, w.after - 1, w.time) for i, task in enumerate(tasks) for w in task.waits], np.int64),
+        locations=np.array([task.location for task in tasks]),
+        weights=np.array([task.weight for task in tasks]),
+        proximity=file.proximity,
+        safety_distance=file.safety_distance,
+        learning=file.learning,
+        durations=file.durations,
+        duration_range=file.duration_range,
+        n_rounds=file.n_rounds,
+        map_width=file.map_width,
+    )
