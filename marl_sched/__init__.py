@@ -5,13 +5,16 @@
     env = airme_v0.env()                                    # PettingZoo AEC
     policy = marl_sched.load_policy("airme-local-profit")   # needs torch, the environments do not
 
-Importing this package imports nothing else; each name is loaded when it is first used.
+Importing this package registers its environments with Gymnasium and imports nothing else; each name is loaded
+when it is first used.
 """
 
 from __future__ import annotations
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
+
+from marl_sched.gymnasium_ids import register as _register
 
 if TYPE_CHECKING:
     from marl_sched import airme_v0 as airme_v0
@@ -40,3 +43,6 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted(set(globals()) | set(__all__))
+
+
+_register()

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium import spaces
 
+from marl_sched.envs.airme.dynamics import IDLE
+
 if TYPE_CHECKING:
     from marl_sched.envs.airme.simulator import AirmeSimulator
 
@@ -15,7 +17,9 @@ class HourlyDecisions:
     """A joint action is a target for each crew, int64 (C,); one step is one hour.
 
     Targets of busy crews are ignored. A plane that is in somebody's hands, chosen by a lower crew this hour or
-    not of this fleet idles its crew, whose index the step's infos list under `illegal`.
+    not of this fleet idles its crew, whose index the step's infos list under `illegal`. Free crews decide in
+    ascending order; under the scheme `skip` the first target 0 ends the hour's decisions, under `single` the
+    first decision does, and the targets of the remaining crews are ignored (section 6.3.1).
     """
 
     def action_space(self, simulator: AirmeSimulator) -> spaces.MultiDiscrete:
@@ -24,17 +28,17 @@ class HourlyDecisions:
 
     def play(self, simulator: AirmeSimulator, action: Any) -> tuple[float, dict[str, Any]]:
         """Play one hour of row 0; the reward of the hour, and which crews idled for an impossible target."""
-        choices = np.asarray(action, np.int64)
-        free = simulator.free_agents(0)
+        choices = np.full(simulator.max_agents, IDLE, np.int64)
         planes = simulator.state.planes[0]
-        taken: set[int] = set()
         illegal = []
-        for crew in free:
-            target = int(choices[crew])
-            if target == 0:
-                continue
-            if target > simulator.state.rows["n_planes"][0] or planes["crew"][target] >= 0 or target in taken:
-                illegal.append(int(crew))
-            taken.add(target)
+        taken: set[int] = set()
+        for crew in simulator.free_agents(0):
+            target = choices[crew] = int(action[crew])
+            if target != IDLE:
+                if target > simulator.state.rows["n_planes"][0] or planes["crew"][target] >= 0 or target in taken:
+                    illegal.append(int(crew))
+                taken.add(target)
+            if simulator.scheme == "single" or (simulator.scheme == "skip" and target == IDLE):
+                break
         simulator.play_hour(choices[None])
         return float(simulator.reward[0]), {"illegal": illegal}

@@ -1,0 +1,141 @@
+"""AirME: crews decide which aircraft to maintain next, before or after it breaks.
+
+![timeline of a fleet](../docs/images/airme.png)
+
+A fleet of fixed-wing aircraft and helicopters flies missions. Every flying hour wears parts whose failure model
+(Weibull, hidden from the agents) makes a plane more likely to break; a broken plane earns nothing and takes
+12 hours more to repair than one that was taken in time. There are fewer crews than planes. Each crew is an agent:
+whenever it is free it chooses a plane to repair, or idles. All crews share one reward, what the fleet earns.
+
+| | |
+|---|---|
+| Import | `from marl_sched import airme_v0` |
+| Agents | `crew_0` .. `crew_7` (`small`), as many as the instance has; padded to the scale's largest |
+| Actions | discrete: 0 idles, s > 0 repairs the plane in slot s; parallel: yes; manual control: no |
+| Observations | the problem graph as the crew sees it, a Dict with an action mask |
+| Reward | of an hour: profit, revenue or availability, the same for all crews |
+
+### Scales
+| | fixed-wing | helicopters | crews | slots |
+|---|---|---|---|---|
+| `small` | 16-24 | 8-12 | 6-8 | 36 + 1 |
+| `medium` | 32-48 | 16-24 | 12-16 | 72 + 1 |
+| `large` | 64-96 | 32-48 | 24-32 | 144 + 1 |
+
+### Turns
+In every hour each free crew has one turn, in ascending order; it sees what the crews before it chose, as far as
+its view allows. Then the hour passes, and every hour after it in which no crew is free. In `parallel_env` all free
+crews choose at once; where two choose one plane, a counter-based draw decides who has it and the other idles.
+
+### Observation
+`{"observation": {...}, "action_mask": int8 (P + 1,)}` with P planes and C crews of the scale's largest instance.
+Slot 0 is the null plane. Hidden and padded nodes are zero and leave the masks.
+
+| array | shape | dtype | meaning |
+|---|---|---|---|
+| `plane` | (P + 1, 18) | float32 | counters, income, mission, repair, age of the picture, type |
+| `plane_mask` | (P + 1,) | int8 | the plane exists and is visible |
+| `crew` | (C, 6) | float32 | free, busy, has chosen, is acting, its job |
+| `crew_mask` | (C,) | int8 | the crew exists and is visible |
+| `state` | (11,) | float32 | shares and means over the visible planes and crews |
+| `repairing` | (C,) | int64 | the slot that a crew repairs or has chosen, -1: none |
+| `time` | () | float32 | hour |
+| `visible_share` | () | float32 | share of the planes that this crew sees |
+
+`AirmeSimulator.graph` names every feature. `env.infos[agent]` repeats the mask as `action_mask` and holds `time`,
+`visible_share` and `conflict`: the crew's previous choice was legal in its view but the plane was already in other
+hands, so it idled. `env.state()` is the same graph under the full view.
+
+### Reward and end
+After a step `rewards` holds for all crews alike the sum of the rewards of the hours that this step let pass. With
+the fleet's total hourly income I, profit is (income of flying planes - repair cost) / I, revenue the first term,
+availability the share of planes neither broken nor in repair. After `horizon` hours the episode is truncated;
+with `stop_share` it terminates when that share of planes is broken. All crews end together.
+
+### Options of `env`, `raw_env` and `parallel_env`
+| option | default | meaning |
+|---|---|---|
+| `scale` | `"small"` | of the generated instances and of the padding; None: pad to `instance` |
+| `instance` | None | an `AirmeInstance` or its file for all episodes; None: each episode draws its own |
+| `view` | `"full"` | or `"local"`, `{"kind": "local", "reach": 1, "comm": 1, "staleness": 0}`, a view object |
+| `objective` | `"profit"` | or `"revenue"`, `"availability"` |
+| `horizon` | 720 | hours |
+| `seed` | 0 | of the episodes until a reset gives another |
+| `failure` | `"density"` | as published, or `"hazard"` |
+| `stop_share` | None | the published early end is 0.8 |
+| `render_mode` | None | `"ansi"`: a fleet board; `"rgb_array"`: the timeline of every plane |
+
+Unknown options raise TypeError. `reset(seed=s)` starts episode 0 of seed s, `reset()` goes on to the next one, with
+a new instance unless one is fixed and with new noise; `reset(options={"instance": ...})` plays that instance once.
+A choice that the mask forbids raises `IllegalActionError` and leaves the turn to be taken; in `parallel_env` it
+idles the crew, whose info says `illegal`.
+
+### Example
+```python
+from marl_sched import airme_v0
+
+env = airme_v0.env(scale="small", view="local")
+env.reset(seed=1)
+for agent in env.agent_iter():
+    observation, reward, termination, truncation, info = env.last()
+    over = termination or truncation
+    env.step(None if over else env.action_space(agent).sample(observation["action_mask"]))
+```
+
+### Version history
+* v0: the simulator of the dissertation, chapter 6, with turns instead of a central list of decisions.
+
+### Source
+Zheyuan Wang, *Learning dynamic priority scheduling policies with graph attention networks*, dissertation, Georgia
+Institute of Technology, December 2022, chapter 6 (AirME and HetGPO).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pettingzoo.utils.wrappers import OrderEnforcingWrapper
+
+from marl_sched.envs.aec import SchedulingAEC
+from marl_sched.envs.airme.instance import AirmeInstance
+from marl_sched.envs.parallel import SchedulingParallel
+
+__all__ = ["env", "parallel_env", "raw_env"]
+
+
+def raw_env(
+    *,
+    scale: str | None = "small",
+    instance: AirmeInstance | str | Path | None = None,
+    view: Any = "full",
+    objective: str = "profit",
+    horizon: int = 720,
+    seed: int = 0,
+    failure: str = "density",
+    stop_share: float | None = None,
+    render_mode: str | None = None,
+) -> SchedulingAEC:
+    """The AEC environment without wrappers; the module's page explains the options."""
+    return SchedulingAEC("airme", **locals())
+
+
+def env(**options: Any) -> OrderEnforcingWrapper:
+    """The AEC environment, with PettingZoo's check that it is reset before it is used; options as `raw_env`."""
+    return OrderEnforcingWrapper(raw_env(**options))
+
+
+def parallel_env(
+    *,
+    scale: str | None = "small",
+    instance: AirmeInstance | str | Path | None = None,
+    view: Any = "full",
+    objective: str = "profit",
+    horizon: int = 720,
+    seed: int = 0,
+    failure: str = "density",
+    stop_share: float | None = None,
+    render_mode: str | None = None,
+) -> SchedulingParallel:
+    """The Parallel environment; the module's page explains the options."""
+    return SchedulingParallel("airme", **locals())
