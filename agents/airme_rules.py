@@ -8,11 +8,12 @@ dissertation puts it. Rules may recall flying planes.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
 
 import numpy as np
 
 from marl_sched.agents.base import ObservationScheduler, best_target
-from marl_sched.envs.airme.aircraft import PUBLISHED_TYPES, AircraftType, part_failure
+from marl_sched.envs.airme.aircraft import PUBLISHED_TYPES, AircraftType, failure_table
 from marl_sched.envs.airme.graph import graph_spec
 from marl_sched.errors import InvalidOptionError
 
@@ -110,16 +111,21 @@ def model_based(threshold: float = _FAILURE_THRESHOLD, types: Sequence[AircraftT
     """Broken planes by income, then unbroken ones by their true failure probability of an hour flown now."""
 
     def priority(fleet: _Fleet) -> np.ndarray:
+        kind = fleet.types.argmax(axis=-1)
+        hours, landings = fleet.hours.astype(np.int64), fleet.landings.astype(np.int64)
+        table = _failure_table(tuple(types), int(max(hours.max(), landings.max())).bit_length())
         survival = np.ones_like(fleet.hours)
-        for k, kind in enumerate(types):
-            of_kind = np.ones_like(fleet.hours)
-            for part in range(len(kind.scales)):
-                of_kind *= 1.0 - part_failure(kind, part, fleet.landings if part == 0 else fleet.hours)
-            survival = np.where(fleet.types[..., k] > 0, of_kind, survival)
+        for part in range(table.shape[1]):
+            survival *= 1.0 - table[kind, part, landings if part == 0 else hours]
         risk = 1.0 - survival
         return np.where(fleet.broken, _FIRST + fleet.income, np.where(risk >= threshold, risk, -np.inf))
 
     return PriorityRule("model-based", priority, needs="failure model")
+
+
+@lru_cache(maxsize=16)
+def _failure_table(types: tuple[AircraftType, ...], bits: int) -> np.ndarray:
+    return failure_table(types, (1 << bits) - 1)
 
 
 def preventive_first(hours: float = _PREVENTIVE_HOURS, landings: float = _PREVENTIVE_LANDINGS) -> PriorityRule:

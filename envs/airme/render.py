@@ -18,7 +18,13 @@ COLOURS = {
     BROKEN: (203, 67, 53),
     REPAIR: (244, 176, 64),
 }
-_CELL = 4  # pixels a plane is high
+LEGEND = {
+    "flying": COLOURS[FLYING],
+    "grounded": COLOURS[GROUNDED],
+    "in repair": COLOURS[REPAIR],
+    "broken and waiting": COLOURS[BROKEN],
+}
+CELL = 4  # pixels a plane is high
 _HOUR = 2  # pixels an hour is wide
 _BOARD_COLUMNS = 3
 
@@ -62,6 +68,6 @@ def timeline(simulator: AirmeSimulator, row: int = 0) -> np.ndarray:
     hours, n_planes = max(int(simulator.time[row]), 1), simulator.state.rows["n_planes"][row]
     status = simulator.state.timeline[row, :hours, 1 : n_planes + 1].T
     palette = np.array([COLOURS[k] for k in sorted(COLOURS)], np.uint8)
-    image = palette[status].repeat(_CELL, axis=0).repeat(_HOUR, axis=1)
-    image[_CELL - 1 :: _CELL] = 255
+    image = palette[status].repeat(CELL, axis=0).repeat(_HOUR, axis=1)
+    image[CELL - 1 :: CELL] = 255
     return image

@@ -1,0 +1,89 @@
+"""What `marl-sched compare` adds to the numbers: pictures, each drawn from something that is at hand as a file.
+
+Bars are drawn from results as JSON and learning curves from training logs as CSV; a timeline is one episode
+played again, which counter-based randomness makes the same one.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from marl_sched.agents.base import Scheduler
+from marl_sched.domain import Domain
+from marl_sched.errors import InvalidFileError
+from marl_sched.simulation import TurnSimulator
+from marl_sched.train import plots
+from marl_sched.train.evaluate import Settings
+
+SECONDS, SCORE = "seconds", "validation"  # the columns of a training log that are drawn
+
+
+def draw_scores(results: Mapping[str, Any], path: Path) -> Path:
+    """The bars of an evaluation (schema 1) as a picture; its path."""
+    return plots.save(plots.score_bars(results), path)
+
+
+def draw_timelines(
+    domain: Domain, schedulers: Mapping[str, Scheduler], instance: Any, settings: Settings, path: Path
+) -> Path:
+    """Episode 0 of one instance as each scheduler plays it, one above the other, as a picture; its path."""
+    objective = str(settings.filled_in(domain).objective)
+    panels, hours = {}, 0
+    for name, scheduler in schedulers.items():
+        simulator = play_episode(domain, scheduler, instance, settings)
+        score = simulator.objectives()[objective][0]
+        panels[f"{name}: {objective} {score:.3f}"] = domain.render["rgb_array"](simulator, 0)
+        hours = max(hours, int(simulator.time[0]))
+    legend, band = domain.extras.get("legend"), domain.extras.get("band")
+    title = "the same instance with the same noise"
+    return plots.save(plots.timelines(panels, hours=hours, legend=legend, band=band, title=title), path)
+
+
+def draw_learning_curves(logs: Iterable[Path], path: Path) -> Path:
+    """The learning curves of training logs, each named after its run's folder, as a picture; its path."""
+    curves = {log.absolute().parent.name: read_learning_curve(log) for log in logs}
+    return plots.save(plots.learning_curves(curves), path)
+
+
+def play_episode(domain: Domain, scheduler: Scheduler, instance: Any, settings: Settings) -> TurnSimulator:
+    """The simulator after episode 0 of an instance, with what its pictures are drawn from on record."""
+    simulator = settings.simulator(domain, [instance], **domain.render_options.get("rgb_array", {}))
+    simulator.reset(seed=settings.seed, episodes=[0])
+    scheduler.start(simulator, np.ones(1, np.bool_))
+    while not simulator.over.all():
+        simulator.step(scheduler.decide(simulator))
+    return simulator
+
+
+def read_learning_curve(log: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Minutes and validation scores, float64 (N,) each, of the rows of a training log that were validated.
+
+    Raises InvalidFileError for a file that is not such a log.
+    """
+    try:
+        with log.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+    except OSError as error:
+        raise InvalidFileError(log, "", f"a readable file ({error.strerror})") from error
+    except UnicodeDecodeError as error:
+        raise InvalidFileError(log, f"byte {error.start}", "UTF-8 text") from error
+    minutes, scores = [], []
+    for line, row in enumerate(rows, start=2):
+        for column in (SECONDS, SCORE):
+            if row.get(column) is None:
+                raise InvalidFileError(log, f"line {line}", f"a column {column!r}")
+        if row[SCORE] == "":
+            continue
+        try:
+            minutes.append(float(row[SECONDS]) / 60)
+            scores.append(float(row[SCORE]))
+        except ValueError as error:
+            raise InvalidFileError(log, f"line {line}", "numbers", f"{row[SECONDS]}, {row[SCORE]}") from error
+    if not scores:
+        raise InvalidFileError(log, "", "at least one validated row")
+    return np.array(minutes), np.array(scores)
