@@ -42,17 +42,46 @@ class CentralFace(Protocol):
         """Take all turns that a joint action covers in row 0; the reward it brought and the step's infos."""
 
 
-class Telemetry(Protocol):
-    """How a domain's true state is told over a wire, and what an agent may hear of it under its view.
+class Belief(Protocol):
+    """What one deployed agent knows: filled from the messages it may hear, read as an observation.
 
-    Both sides are pure: bytes in, bytes out, no transport. A channel is the part of a key after the run's name.
+    Attributes:
+        channels: the channels that the agent's view allows it to hear, sorted. It hears nothing else.
     """
+
+    channels: tuple[str, ...]
+
+    def hear(self, channel: str, payload: bytes) -> None:
+        """Take in a channel's newest payload; InvalidMessageError, and no change, if it does not parse."""
+
+    def observe(self) -> dict[str, np.ndarray]:
+        """The agent's observation with B = 1, bit-equal to the simulator's when every channel is up to date."""
+
+
+class Telemetry(Protocol):
+    """How a domain's true state is told over a wire, and what an agent makes of the part that it may hear.
+
+    Both sides are pure: bytes out, bytes in, no transport. A channel is the part of a key after the run's name;
+    its payload is a state, not a change, so the newest one is all that a late listener needs. All methods of
+    the world's side speak of row 0.
+
+    Attributes:
+        moment: what a unit of simulated time is called in reports, such as "hour".
+    """
+
+    moment: str
+
+    def frame(self, simulator: TurnSimulator) -> bytes:
+        """What every agent is told at the start: sizes, padding and view, nothing that a view hides."""
 
     def messages(self, simulator: TurnSimulator) -> dict[str, bytes]:
         """Everything the world says at this moment: channel -> payload."""
 
-    def channels(self, agent: int, simulator_options: Mapping[str, Any]) -> list[str]:
-        """The channels that this agent's view allows it to hear, sorted."""
+    def series(self, simulator: TurnSimulator) -> dict[str, list[float]]:
+        """The objectives of every moment so far, name -> one value per moment."""
+
+    def belief(self, frame: bytes, agent: int) -> Belief:
+        """An agent's empty belief; InvalidMessageError for a frame that does not parse or lacks the agent."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +103,9 @@ class Domain:
             or None: the largest of the given instances); unknown options raise TypeError.
         central: the centralised face.
         render: mode -> function of a simulator row, `ansi` gives str, `rgb_array` gives uint8 (H, W, 3).
+        render_options: render mode -> options that a simulator must be made with to be drawn so.
         default_horizon: simulated time of an episode.
+        telemetry: how the state travels to deployed agents; None: the domain cannot be deployed.
     """
 
     name: str
@@ -90,6 +121,8 @@ class Domain:
     central: CentralFace
     render: Mapping[str, Callable[[Any, int], Any]]
     default_horizon: int
+    telemetry: Telemetry | None = None
+    render_options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     extras: Mapping[str, Any] = field(default_factory=dict)
 
     def agent_name(self, agent: int) -> str:

@@ -43,6 +43,10 @@ class IllegalActionError(MarlSchedError, ValueError):
     """A choice that the action mask forbids or that lies outside the action space."""
 
 
+class InvalidMessageError(MarlSchedError, ValueError):
+    """A message from the wire that does not parse or contradicts the channel it came on."""
+
+
 class DeploymentError(MarlSchedError, RuntimeError):
     """A distributed run that could not start or finish; the message names the process that is at fault."""
 

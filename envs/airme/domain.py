@@ -8,6 +8,7 @@ from marl_sched.envs.airme.central import HourlyDecisions
 from marl_sched.envs.airme.dynamics import OBJECTIVES
 from marl_sched.envs.airme.instance import SCALES, AirmeInstance, generate, load
 from marl_sched.envs.airme.simulator import DEFAULT_HORIZON, AirmeSimulator
+from marl_sched.envs.airme.telemetry import AirmeTelemetry
 from marl_sched.envs.airme.views import VIEWS
 
 AIRME = register(
@@ -24,6 +25,13 @@ AIRME = register(
         simulator=AirmeSimulator,
         central=HourlyDecisions(),
         render={"ansi": render.fleet_board, "rgb_array": render.timeline},
+        render_options={"rgb_array": {"record_timeline": True}},
         default_horizon=DEFAULT_HORIZON,
+        telemetry=AirmeTelemetry(),
+        extras={
+            "reference": "corrective-published",  # M2 is the gain over it, section 6.5.2
+            "legend": render.LEGEND,
+            "band": ("plane", render.CELL),
+        },
     )
 )

@@ -1,0 +1,149 @@
+"""What a world, an agent and a whole deployment can be told, checked before anything starts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from marl_sched.comms.messages import run_prefix
+from marl_sched.domain import Domain, get_domain
+from marl_sched.errors import InvalidOptionError, require
+
+if TYPE_CHECKING:
+    from marl_sched.simulation import TurnSimulator
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldOptions:
+    """The plant: which problem, how agents see it, and how long it waits for them.
+
+    Attributes:
+        env: a domain's name.
+        scale: of the generated instance and of the padding; with `instance` the padding alone, or "".
+        instance: an instance file; "" generates the scale's first instance of `seed`.
+        seed: of the instance's generator and of the noise.
+        hours: simulated time of the run; 0: the domain's horizon.
+        objective: what the run is rewarded for; "": the domain's first.
+        view, view_options: what agents see.
+        run: the run's name, part of every key.
+        listen: endpoint, port 0 takes a free one.
+        deadline: seconds that a decision may take; a late one idles the agent for this moment.
+        patience: this many missed deadlines in a row make an agent count as dead: it is not asked any more. So
+            an agent that falls silent delays the others by at most patience x deadline seconds, one whose process
+            ends or freezes by at most a second, as its liveliness token goes.
+        ready_timeout: seconds to wait for all agents at the start.
+        report: file for the JSON report; "" writes none.
+    """
+
+    env: str = "airme"
+    scale: str = "small"
+    instance: str = ""
+    seed: int = 0
+    hours: int = 0
+    objective: str = ""
+    view: str = "full"
+    view_options: Mapping[str, int] = field(default_factory=dict)
+    run: str = "run"
+    listen: str = DEFAULT_ENDPOINT
+    deadline: float = 2.0
+    patience: int = 3
+    ready_timeout: float = 60.0
+    report: str = ""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be run."""
+        run_prefix(self.run)
+        _require_positive(self, "deadline", "ready_timeout")
+        if self.patience < 1:
+            raise InvalidOptionError(f"patience: expected at least 1 missed deadline, got {self.patience}")
+        if self.hours < 0 or self.seed < 0:
+            raise InvalidOptionError(f"hours and seed: expected integers >= 0, got {self.hours} and {self.seed}")
+
+    def domain(self) -> Domain:
+        """The domain; InvalidOptionError if it cannot be deployed."""
+        domain = get_domain(self.env)
+        if domain.telemetry is None:
+            raise InvalidOptionError(f"env: {self.env} has no telemetry and cannot be deployed")
+        return domain
+
+    def simulator(self) -> TurnSimulator:
+        """The plant's simulator, one row at the start of its episode; typed errors for options that do not fit."""
+        domain = self.domain()
+        view_type: Any = domain.views[require(f"view of {self.env}", self.view, domain.views)]
+        try:
+            view = view_type(**self.view_options)
+        except TypeError as error:
+            raise InvalidOptionError(f"view {self.view}: {error}") from error
+        if self.instance:
+            instance = domain.load(Path(self.instance))
+        else:
+            instance = domain.generate(domain.require_scale(self.scale), np.random.default_rng([self.seed, 0]))
+        return domain.simulator(
+            [instance],
+            view=view,
+            objective=domain.require_objective(self.objective or domain.objectives[0]),
+            horizon=self.hours or domain.default_horizon,
+            seed=self.seed,
+            pad=domain.require_scale(self.scale) if self.scale else None,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class AgentOptions:
+    """One agent: who it is, what decides for it, and where its world is.
+
+    Attributes:
+        agent: its index.
+        policy: a scheduler's name or a checkpoint's path.
+        run, connect: the world's `run` and endpoint.
+        join_timeout: seconds to wait for the world, at the start and when it has been lost.
+    """
+
+    agent: int
+    policy: str
+    run: str = "run"
+    connect: str = DEFAULT_ENDPOINT
+    join_timeout: float = 60.0
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be run."""
+        run_prefix(self.run)
+        _require_positive(self, "join_timeout")
+        if self.agent < 0:
+            raise InvalidOptionError(f"agent: expected an index >= 0, got {self.agent}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeployOptions:
+    """A world and all its agents on this machine.
+
+    Attributes:
+        world: the plant's options.
+        policy: what decides for every agent...
+        agent_policies: ...but for these, agent's name -> policy.
+    """
+
+    world: WorldOptions = field(default_factory=lambda: WorldOptions(listen="tcp/127.0.0.1:0"))
+    policy: str = "condition"
+    agent_policies: Mapping[str, str] = field(default_factory=dict)
+
+    def policies(self, n_agents: int) -> list[str]:
+        """One policy per agent; UnknownNameError for an agent that does not exist."""
+        domain = self.world.domain()
+        names = [domain.agent_name(i) for i in range(n_agents)]
+        for name in self.agent_policies:
+            require(f"agent of this {domain.name} problem", name, names)
+        return [self.agent_policies.get(name, self.policy) for name in names]
+
+
+def _require_positive(options: Any, *names: str) -> None:
+    for name in names:
+        value = getattr(options, name)
+        if not value > 0:
+            raise InvalidOptionError(f"{name}: expected a number > 0 (seconds), got {value}")
