@@ -11,7 +11,8 @@ The name is absorbed in two steps, because a simulator reuses the first for thou
     moment = moment_key(episode_key(seed, instance, episode), time)
     u = uniform(moment, stream, entity, draw)
 
-All functions are compiled and may be called from Python or from other kernels. Streams below
+All functions are compiled and may be called from Python or from other kernels. Called from Python, a key
+comes back as a plain int: pass it on as `np.uint64(key)`, since Numba takes plain ints for signed. Streams below
 `FIRST_DOMAIN_STREAM` are shared by all domains; a domain numbers its own from there on.
 """
 

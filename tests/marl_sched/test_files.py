@@ -1,0 +1,92 @@
+import json
+import os
+import stat
+
+import pytest
+
+from marl_sched.errors import InvalidFileError
+from marl_sched.files import read_json, replacing, write_json
+
+
+def fail_halfway(target):
+    with replacing(target) as temporary:
+        temporary.write_text('{"half": ')
+        raise RuntimeError("halfway")
+
+
+def test_json_comes_back_as_it_was_written(tmp_path):
+    data = {"name": "Flügel", "income": [1.5, 2], "broken": False, "none": None}
+    write_json(tmp_path / "a.json", data)
+    assert read_json(tmp_path / "a.json") == data
+
+
+def test_missing_folders_are_made(tmp_path):
+    write_json(tmp_path / "deep" / "er" / "a.json", 1)
+    assert read_json(tmp_path / "deep" / "er" / "a.json") == 1
+
+
+def test_failed_write_leaves_the_old_file_and_nothing_else(tmp_path):
+    target = tmp_path / "a.json"
+    write_json(target, "old")
+    with pytest.raises(RuntimeError, match="halfway"):
+        fail_halfway(target)
+    assert read_json(target) == "old"
+    assert [path.name for path in tmp_path.iterdir()] == ["a.json"]
+
+
+def test_target_is_untouched_until_the_block_ends(tmp_path):
+    target = tmp_path / "a.txt"
+    target.write_text("old")
+    with replacing(target) as temporary:
+        temporary.write_text("new")
+        assert target.read_text() == "old"
+        assert temporary.parent == tmp_path  # a rename never crosses file systems
+    assert target.read_text() == "new"
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), {1, 2}])
+def test_what_is_not_json_is_refused_and_nothing_is_written(tmp_path, value):
+    with pytest.raises((ValueError, TypeError)):
+        write_json(tmp_path / "a.json", [1, value])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_new_file_has_the_permissions_that_the_umask_grants(tmp_path):
+    before = os.umask(0o027)
+    try:
+        write_json(tmp_path / "a.json", 1)
+        assert os.umask(0o027) == 0o027
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "a.json").stat().st_mode) == 0o640
+
+
+def test_missing_file_is_named(tmp_path):
+    with pytest.raises(InvalidFileError, match=r"gone\.json: expected a readable file \(No such file or directory\)"):
+        read_json(tmp_path / "gone.json")
+
+
+def test_folder_is_no_file(tmp_path):
+    with pytest.raises(InvalidFileError, match=r"expected a readable file \(Is a directory\)"):
+        read_json(tmp_path)
+
+
+def test_malformed_json_is_located(tmp_path):
+    path = tmp_path / "bad.json"
+    path.write_text('{"a": 1,\n "b": }')
+    with pytest.raises(InvalidFileError, match=r"bad\.json: line 2 column 7: expected valid JSON"):
+        read_json(path)
+
+
+def test_truncated_file_is_located(tmp_path):
+    path = tmp_path / "short.json"
+    path.write_text(json.dumps({"planes": [1, 2, 3]})[:-3])
+    with pytest.raises(InvalidFileError, match=r"short\.json: line 1 column \d+: expected valid JSON"):
+        read_json(path)
+
+
+def test_bytes_that_are_no_text_are_located(tmp_path):
+    path = tmp_path / "latin.json"
+    path.write_bytes(b'{"name": "Fl\xfcgel"}')
+    with pytest.raises(InvalidFileError, match=r"latin\.json: byte 12: expected UTF-8 text"):
+        read_json(path)
