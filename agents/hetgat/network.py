@@ -1,0 +1,140 @@
+"""Stacks of HetGAT layers with a head: the policy's logits over decisions, and a critic's value.
+
+No weight depends on the graph's size: the same network runs on any number of planes, crews, tasks or agents.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+
+import torch
+from torch import Tensor, nn
+
+from marl_sched.agents.hetgat.inputs import GraphInputs, read_graph
+from marl_sched.agents.hetgat.layer import HetGATLayer, LayerWeights
+from marl_sched.graph import ACTION_MASK, DECISION, STATE, GraphSpec
+
+EncoderWeights = tuple[LayerWeights, ...]
+
+
+class HetGATEncoder(nn.Module):
+    """Layers that turn a graph into features of the node types `outputs`.
+
+    All layers but the last concatenate their heads, the last averages them, so a node ends with `width`
+    features. What no output depends on has no parameters and is not computed.
+
+    Args:
+        spec: the metagraph.
+        width: features per head.
+        heads: heads per layer.
+        layers: number of layers, at least 1.
+        outputs: node types, `state` and `decision` among them.
+    """
+
+    def __init__(self, spec: GraphSpec, *, width: int, heads: int, layers: int, outputs: Collection[str]) -> None:
+        super().__init__()
+        self.spec = spec
+        sizes = {node.name: len(node.features) for node in spec.nodes}
+        sizes |= {STATE: len(spec.state_features), DECISION: 0}
+        stack = []
+        for wanted in _needed(spec, outputs, layers):
+            merge = "mean" if len(stack) == layers - 1 else "concat"
+            layer = HetGATLayer(spec, sizes, width=width, heads=heads, merge=merge, outputs=wanted)
+            sizes = {name: layer.out_size if name in wanted else 0 for name in sizes}
+            stack.append(layer)
+        self.layers = nn.ModuleList(stack)
+        self._relations = {relation.key: relation for layer in stack for relation in layer.relations}
+
+    def weights(self, *, joined: bool = False) -> EncoderWeights:
+        """All layers' weights as they are applied (`HetGATLayer.weights`), for passes with fixed parameters."""
+        return tuple(layer.weights(joined=joined) for layer in self.layers)
+
+    def forward(
+        self, observation: Mapping[str, Tensor], weights: EncoderWeights | None = None
+    ) -> tuple[dict[str, Tensor], GraphInputs]:
+        """Features (B, n, width) of the output node types, (B, 1, width) for the state, and the graph read."""
+        dtype = self.layers[0].bias[next(iter(self.layers[0].bias))].dtype
+        graph = read_graph(self.spec, observation, self._relations.values(), dtype)
+        nodes = graph.nodes
+        for layer, applied in zip(self.layers, weights or self.weights(), strict=True):
+            nodes = layer(graph, nodes, applied)
+        return nodes, graph
+
+
+class HetGATNetwork(nn.Module):
+    """A policy's network: logits over the decision nodes.
+
+    Args:
+        spec: the metagraph.
+        width, heads, layers: sizes of the encoder; the dissertation's are 32, 4 and 3.
+    """
+
+    def __init__(self, spec: GraphSpec, *, width: int = 8, heads: int = 4, layers: int = 3) -> None:
+        super().__init__()
+        self.spec = spec
+        self.sizes = {"width": width, "heads": heads, "layers": layers}
+        self.encoder = HetGATEncoder(spec, width=width, heads=heads, layers=layers, outputs=[DECISION])
+        self.readout = nn.Linear(width, 1)
+        # Nearly equal logits: an untrained policy explores all legal targets alike.
+        nn.init.normal_(self.readout.weight, std=0.01)
+        nn.init.zeros_(self.readout.bias)
+
+    def weights(self, *, joined: bool = False) -> EncoderWeights:
+        """All layers' weights as they are applied (`HetGATLayer.weights`), for passes with fixed parameters."""
+        return self.encoder.weights(joined=joined)
+
+    def forward(self, observation: Mapping[str, Tensor], weights: EncoderWeights | None = None) -> Tensor:
+        """Logits (B, n_targets) from the tensors of an observation (marl_sched.graph, with batch axis).
+
+        Targets outside the action mask get the dtype's lowest finite number: their probability is exactly
+        zero, and p log p is zero where -inf would make it NaN.
+        """
+        nodes, _ = self.encoder(observation, weights)
+        logits = self.readout(nodes[DECISION]).squeeze(-1)
+        return torch.where(observation[ACTION_MASK] != 0, logits, torch.finfo(logits.dtype).min)
+
+
+class HetGATCritic(nn.Module):
+    """A value function that sums one term for each visible node and one for the state.
+
+    It sees nothing of a deployed agent's business, so it may be given the full graph and what no node
+    carries, such as the time left in the episode.
+
+    Args:
+        spec: the metagraph.
+        width, heads, layers: sizes of the encoder.
+        extra: number of inputs beside the graph, which enter the state's term.
+    """
+
+    def __init__(
+        self, spec: GraphSpec, *, width: int = 8, heads: int = 4, layers: int = 2, extra: int = 0
+    ) -> None:
+        super().__init__()
+        self.spec = spec
+        names = [node.name for node in spec.nodes]
+        self.encoder = HetGATEncoder(spec, width=width, heads=heads, layers=layers, outputs=[*names, STATE])
+        self.node_terms = nn.ModuleDict({name: nn.Linear(width, 1) for name in names})
+        hidden = width * heads
+        self.state_term = nn.Sequential(nn.Linear(width + extra, hidden), nn.ReLU(), nn.Linear(hidden, 1))
+        # The sum over a fleet of random terms would start far from any return.
+        for last in (*self.node_terms.values(), self.state_term[-1]):
+            nn.init.zeros_(last.weight)
+            nn.init.zeros_(last.bias)
+
+    def forward(self, observation: Mapping[str, Tensor], extra: Tensor | None = None) -> Tensor:
+        """Values (B,) from an observation's tensors and, if the critic has them, `extra` inputs (B, n_extra)."""
+        nodes, graph = self.encoder(observation)
+        state = nodes[STATE].squeeze(1)
+        value = self.state_term(state if extra is None else torch.cat([state, extra], dim=-1)).squeeze(-1)
+        for name, term in self.node_terms.items():
+            value = value + torch.where(graph.masks[name], term(nodes[name]).squeeze(-1), 0.0).sum(-1)
+        return value
+
+
+def _needed(spec: GraphSpec, outputs: Collection[str], layers: int) -> list[set[str]]:
+    """The node types that each layer has to compute, first layer first."""
+    needed = [set(outputs)]
+    while len(needed) < layers:
+        sources = {relation.source for relation in spec.relations if relation.target in needed[0]}
+        needed.insert(0, needed[0] | sources)
+    return needed
