@@ -15,7 +15,7 @@ from marl_sched.envs.single import SingleEpisode
 from marl_sched.envs.spaces import action_space, graph_space, observation_space
 from marl_sched.errors import IllegalActionError, UnknownNameError
 from marl_sched.graph import ACTION_MASK, VISIBLE_SHARE
-from marl_sched.noise import Stream, moment_key, uniform
+from marl_sched.noise import Stream, uniforms
 
 Observations = dict[str, dict[str, Any]]
 Infos = dict[str, dict[str, Any]]
@@ -129,11 +129,11 @@ class SchedulingParallel(ParallelEnv):
 
     def _losers(self, choices: Mapping[int, int]) -> set[int]:
         """Who chose a target that the draw gives to another."""
-        moment = np.uint64(moment_key(self.simulator.episode_keys[0], self.simulator.time[0]))
+        keys, time = self.simulator.episode_keys, self.simulator.time
         best: dict[int, tuple[float, int]] = {}
         for agent, target in choices.items():
             if target > 0:
-                bid = (uniform(moment, int(Stream.CONFLICT), target, agent), agent)
+                bid = (uniforms(keys, time, Stream.CONFLICT, np.array([target]), agent)[0], agent)
                 best[target] = min(best.get(target, bid), bid)
         return {agent for agent, target in choices.items() if target > 0 and best[target][1] != agent}
 

@@ -1,0 +1,227 @@
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+from pettingzoo.test import parallel_api_test, parallel_seed_test
+
+from marl_sched.envs.airme.instance import AirmeInstance
+from marl_sched.envs.parallel import SchedulingParallel
+from marl_sched.errors import IllegalActionError, InvalidOptionError, UnknownNameError
+from marl_sched.noise import Stream, moment_key, uniform
+
+HORIZON = 40
+
+
+def make(domain, **options):
+    return SchedulingParallel(domain, **{"horizon": HORIZON, **options})
+
+
+def fleet(n_planes, n_crews):
+    """Healthy aircraft of one type."""
+    return AirmeInstance(
+        n_crews=n_crews,
+        kind=np.zeros(n_planes, int),
+        income=np.full(n_planes, 10.0),
+        hours=np.full(n_planes, 24),
+        landings=np.full(n_planes, 3),
+        broken=np.zeros(n_planes, bool),
+    )
+
+
+def winner(env, target, agents):
+    """Who has the target by the rule, worked out from the noise alone."""
+    moment = np.uint64(moment_key(env.simulator.episode_keys[0], env.simulator.time[0]))
+    draws = {agent: uniform(moment, int(Stream.CONFLICT), target, agent) for agent in agents}
+    return min(draws, key=draws.__getitem__)
+
+
+def test_passes_pettingzoos_parallel_api_test(domain, view, largest_crew, only_mask_warnings):
+    # An instance with fewer agents than the padding makes the kit warn that possible agents never came alive.
+    parallel_api_test(make(domain, view=view, instance=largest_crew), num_cycles=60)
+
+
+def test_passes_the_parallel_api_test_with_padded_agents(domain, padded):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message="No agents present but not all possible_agents are terminated")
+        parallel_api_test(make(domain, instance=padded), num_cycles=60)
+
+
+def test_passes_pettingzoos_parallel_seed_test(domain, only_mask_warnings):
+    parallel_seed_test(lambda: make(domain), num_cycles=20)
+
+
+def test_an_episode_repeats_to_the_last_bit(domain, view, pick):
+    def trace(seed):
+        env = make(domain, view=view)
+        observations, infos = env.reset(seed=seed)
+        out = []
+        for turn in range(10 * HORIZON):
+            out += [array.tobytes() for seen in observations.values() for array in seen["observation"].values()]
+            actions = {a: pick(observations[a]["action_mask"], turn + i) for i, a in enumerate(env.agents)}
+            observations, rewards, terminated, truncated, infos = env.step(actions)
+            out.append((rewards, terminated, truncated, [info["conflict"] for info in infos.values()]))
+            if not env.agents:
+                return out
+        raise AssertionError("the episode does not end")
+
+    assert trace(5) == trace(5)
+    assert trace(5) != trace(6)
+
+
+def test_every_observation_lies_in_its_space(domain, view, padded, pick):
+    env = make(domain, view=view, instance=padded)
+    observations, _ = env.reset(seed=1)
+    turn = 0
+    while env.agents:
+        for agent, seen in observations.items():
+            assert env.observation_space(agent).contains(seen)
+        actions = {a: pick(observations[a]["action_mask"], turn + i) for i, a in enumerate(env.agents)}
+        observations, *_ = env.step(actions)
+        turn += 1
+    assert all(seen["action_mask"].sum() == 1 for seen in observations.values())
+
+
+def test_of_all_who_choose_one_target_the_smallest_draw_has_it():
+    env = make("airme", scale=None, instance=fleet(6, 4))
+    won = set()
+    for seed in range(12):
+        env.reset(seed=seed)
+        best = winner(env, 3, [0, 1, 3])
+        infos = env.step({"crew_0": 3, "crew_1": 3, "crew_2": 5, "crew_3": 3})[-1]
+        assert env.simulator.state.planes["crew"][0, 3] == best
+        assert env.simulator.state.planes["crew"][0, 5] == 2
+        assert {agent for agent, info in infos.items() if info["conflict"]} == (
+            {"crew_0", "crew_1", "crew_3"} - {f"crew_{best}"}
+        )
+        assert not any(info["illegal"] for info in infos.values())
+        won.add(best)
+    assert won == {0, 1, 3}
+
+
+def test_idling_together_is_no_conflict():
+    env = make("airme", scale=None, instance=fleet(6, 4))
+    env.reset(seed=1)
+    infos = env.step(dict.fromkeys(env.agents, 0))[-1]
+    assert not any(info["conflict"] or info["illegal"] for info in infos.values())
+
+
+def test_an_illegal_choice_idles_its_agent_alone():
+    env = make("airme", scale=None, instance=fleet(6, 3), view={"kind": "local", "reach": 0, "comm": 0})
+    observations, _ = env.reset(seed=1)
+    assert observations["crew_0"]["action_mask"].nonzero()[0].tolist() == [0, 1, 4]
+    infos = env.step({"crew_0": 2, "crew_1": 2, "crew_2": 0})[-1]
+    assert infos["crew_0"]["illegal"]
+    assert not infos["crew_0"]["conflict"]
+    assert not infos["crew_1"]["illegal"]
+    assert not infos["crew_1"]["conflict"]
+    assert env.simulator.state.planes["crew"][0, 2] == 1
+    assert env.simulator.state.crews["plane"][0, :3].tolist() == [0, 2, 0]
+
+
+def test_actions_of_busy_agents_are_ignored():
+    env = make("airme", scale=None, instance=fleet(6, 2))
+    env.reset(seed=1)
+    env.step({"crew_0": 1, "crew_1": 0})
+    assert env.simulator.state.crews["plane"][0].tolist() == [1, 0]
+    infos = env.step({"crew_0": 5, "crew_1": 0})[-1]
+    assert not infos["crew_0"]["illegal"]
+    assert env.simulator.state.crews["plane"][0].tolist() == [1, 0]
+    env.step({"crew_1": 0})  # a busy agent needs no action
+    assert env.simulator.time[0] == 3
+
+
+def test_time_passes_until_somebody_is_free():
+    env = make("airme", scale=None, instance=fleet(6, 2))
+    env.reset(seed=1)
+    _, rewards, *_ = env.step({"crew_0": 1, "crew_1": 2})
+    simulator = env.simulator
+    assert simulator.time[0] > 1
+    assert simulator.free_agents(0).size > 0
+    profit = simulator.state.series[0, : simulator.time[0], 0]
+    assert rewards["crew_0"] == rewards["crew_1"] == pytest.approx(profit.sum(), abs=1e-12)
+
+
+def test_rewards_of_any_agent_sum_to_the_objective(domain, pick):
+    env = make(domain)
+    observations, _ = env.reset(seed=3)
+    agent, total, turn = env.agents[-1], 0.0, 0
+    while env.agents:
+        actions = {a: pick(observations[a]["action_mask"], turn + i) for i, a in enumerate(env.agents)}
+        observations, rewards, *_ = env.step(actions)
+        assert len(set(rewards.values())) == 1
+        total += rewards[agent]
+        turn += 1
+    assert total != 0.0
+    if domain.name == "airme":
+        assert total == pytest.approx(env.simulator.objectives()["profit"][0] * HORIZON, abs=1e-12)
+
+
+def test_choices_that_do_not_meet_give_the_trace_of_aec(bits):
+    from marl_sched.envs.aec import SchedulingAEC
+
+    parallel, aec = make("airme"), SchedulingAEC("airme", horizon=HORIZON)
+    observations, _ = parallel.reset(seed=4)
+    aec.reset(seed=4)
+    while parallel.agents:
+        # Crew i keeps to the planes p with p mod n = i, so that no two want the same.
+        n = len(parallel.agents)
+        actions = {}
+        for i, agent in enumerate(parallel.agents):
+            own = [t for t in np.flatnonzero(observations[agent]["action_mask"]) if t > 0 and t % n == i]
+            actions[agent] = own[0] if own else 0
+        for i in parallel.simulator.free_agents(0):
+            assert aec.agent_selection == f"crew_{i}"
+            aec.step(actions[f"crew_{i}"])
+        observations, rewards, *_ = parallel.step(actions)
+        assert set(rewards.values()) == set(aec.rewards.values())
+        assert bits(parallel.simulator.snapshot(0)) == bits(aec.simulator.snapshot(0))
+
+
+def test_errors_come_before_anything_happens(domain, bits):
+    env = make(domain)
+    env.reset(seed=1)
+    before = bits(env.simulator.snapshot(0))
+    idle = dict.fromkeys(env.agents, 0)
+    first = env.agents[0]
+    with pytest.raises(IllegalActionError, match=f"{first}: target 10000: expected one in"):
+        env.step(idle | {first: 10_000})
+    with pytest.raises(IllegalActionError, match=f"{first}: expected an integer target, got 0.5"):
+        env.step(idle | {first: 0.5})
+    with pytest.raises(UnknownNameError, match="agent 'nobody'"):
+        env.step(idle | {"nobody": 0})
+    with pytest.raises(IllegalActionError, match=f"{first}: is free and has no action"):
+        env.step({agent: 0 for agent in env.agents if agent != first})
+    assert bits(env.simulator.snapshot(0)) == before
+
+
+def test_stepping_after_the_end_raises():
+    env = make("airme", horizon=1)
+    env.reset(seed=1)
+    env.step(dict.fromkeys(env.agents, 0))
+    assert env.agents == []
+    with pytest.raises(IllegalActionError, match="over"):
+        env.step({})
+
+
+def test_reset_without_a_seed_goes_on_to_the_next_episode(domain):
+    env = make(domain)
+    env.reset(seed=4)
+    first = env.simulator.instances[0].identity
+    env.reset()
+    assert env.simulator.instances[0].identity != first
+    env.reset(seed=4)
+    assert env.simulator.instances[0].identity == first
+
+
+def test_schemes_are_refused_where_every_free_agent_decides(domain):
+    with pytest.raises(InvalidOptionError, match="scheme"):
+        make(domain, scheme="single")
+
+
+def test_renders_as_the_domain_does(domain):
+    env = make(domain, render_mode="ansi")
+    env.reset(seed=1)
+    assert env.render() == domain.render["ansi"](env.simulator, 0)
