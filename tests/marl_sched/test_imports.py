@@ -112,8 +112,8 @@ def test_a_wrong_import_would_be_seen(tmp_path):
     assert imported_at_once(path) == {"marl_sched.errors", "marl_sched.envs", "marl_sched.agents.base"}
 
 
-def test_importing_the_package_imports_nothing_else():
-    done = run("import sys, marl_sched; print(sorted({'numpy', 'numba', 'gymnasium', 'torch'} & sys.modules.keys()))")
+def test_importing_the_package_loads_neither_kernels_nor_torch():
+    done = run("import sys, marl_sched; print(sorted({'numba', 'scipy', 'pettingzoo', 'torch'} & sys.modules.keys()))")
     assert (done.stdout, done.stderr) == ("[]\n", "")
 
 
