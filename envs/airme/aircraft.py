@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -19,6 +20,7 @@ class AircraftType:
     """One type of aircraft: its failure model, how often it is used and what it may earn.
 
     Part 0 wears with landings, the others with operating hours divided by `hour_norm`.
+    Raises InvalidOptionError for a value outside its domain.
     """
 
     name: str
@@ -29,18 +31,22 @@ class AircraftType:
     income: tuple[float, float]  # bounds of the uniform hourly income
 
     def __post_init__(self) -> None:
-        """Raise InvalidOptionError for a type that cannot be."""
+        """Bring the numbers to plain floats, so that equal types hash alike, and refuse a type that cannot be."""
+        for field in ("scales", "shapes", "income"):
+            object.__setattr__(self, field, tuple(float(value) for value in getattr(self, field)))
+        for field in ("hour_norm", "usage"):
+            object.__setattr__(self, field, float(getattr(self, field)))
         where = f"aircraft type {self.name!r}"
         if not self.scales or len(self.scales) != len(self.shapes):
             raise InvalidOptionError(
                 f"{where}: expected as many scales as shapes and at least one, "
                 f"got {len(self.scales)} scales and {len(self.shapes)} shapes"
             )
-        if min(self.scales) <= 0 or min(self.shapes) <= 0 or self.hour_norm <= 0:
-            raise InvalidOptionError(f"{where}: scales, shapes and hour_norm must be > 0")
+        if not all(0 < value < math.inf for value in (*self.scales, *self.shapes, self.hour_norm)):
+            raise InvalidOptionError(f"{where}: scales, shapes and hour_norm must be finite and > 0")
         if not 0 <= self.usage <= 1:
             raise InvalidOptionError(f"{where}: usage must be a probability, got {self.usage}")
-        if not 0 < self.income[0] <= self.income[1]:
+        if len(self.income) != 2 or not 0 < self.income[0] <= self.income[1] < math.inf:
             raise InvalidOptionError(f"{where}: income must be bounds 0 < low <= high, got {self.income}")
 
 
@@ -68,8 +74,11 @@ def part_failure(kind: AircraftType, part: int, usage: np.ndarray, model: Failur
     count = np.asarray(usage, np.float64)
     scale, shape = kind.scales[part], kind.shapes[part]
     ratio = count / scale if part == 0 else count / kind.hour_norm / scale
-    hazard = shape / scale * ratio ** (shape - 1.0)
-    probability = hazard * np.exp(-(ratio**shape)) if model == "density" else hazard
+    # The hazard overflows where the survival is 0 long since, and at usage 0 for shapes below 1.
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        hazard = shape / scale * ratio ** (shape - 1.0)
+        survival = np.exp(-(ratio**shape))
+        probability = np.where(survival > 0, hazard * survival, 0.0) if model == "density" else hazard
     grace = 0 if part == 0 else HOURS_GRACE
     return np.where(count > grace, np.minimum(probability, 1.0), 0.0)
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from hashlib import blake2b
 from pathlib import Path
@@ -16,6 +17,7 @@ from marl_sched.errors import InvalidFileError, InvalidOptionError, UnknownNameE
 from marl_sched.files import read_json, write_json
 
 SCHEMA = 1
+MOST = 1_000_000  # counters index failure tables and crews size arrays: beyond this a file is wrong, not large
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -52,8 +54,8 @@ class AirmeInstance:
         for name, good, expected in (
             ("kind", (self.kind >= 0) & (self.kind < len(self.types)), f"an index into {len(self.types)} types"),
             ("income", np.isfinite(self.income) & (self.income > 0), "a number > 0 (per flying hour)"),
-            ("hours", self.hours >= 0, "an integer >= 0"),
-            ("landings", self.landings >= 0, "an integer >= 0"),
+            ("hours", (self.hours >= 0) & (self.hours <= MOST), f"an integer in [0, {MOST}]"),
+            ("landings", (self.landings >= 0) & (self.landings <= MOST), f"an integer in [0, {MOST}]"),
         ):
             if not good.all():
                 p = int(np.flatnonzero(~good)[0])
@@ -156,17 +158,18 @@ def load(path: str | Path) -> AirmeInstance:
     reader.check("", data, isinstance(data, dict), "an object")
     reader.check("schema", data.get("schema"), data.get("schema") == SCHEMA, f"{SCHEMA}")
     reader.check("env", data.get("env"), data.get("env") == "airme", "'airme'")
-    crews = reader.take(data, "", "n_crews", _is_count, "an integer >= 1")
+    crews = reader.take(data, "", "n_crews", _is_count, f"an integer in [1, {MOST}]")
     types = tuple(_read_type(reader, f"types[{i}]", row) for i, row in enumerate(reader.rows(data, "types")))
     names = {kind.name: i for i, kind in enumerate(types)}
+    reader.check("types", [kind.name for kind in types], len(names) == len(types), "names that differ")
     columns: dict[str, list[Any]] = {name: [] for name in _ARRAYS}
     for p, row in enumerate(reader.rows(data, "planes")):
         where = f"planes[{p}]"
-        name = reader.take(row, where, "type", lambda v: v in names, f"one of {', '.join(names)}")
+        name = reader.take(row, where, "type", lambda v: isinstance(v, str) and v in names, f"one of {[*names]}")
         columns["kind"].append(names[name])
         columns["income"].append(reader.take(row, where, "income", _is_positive, "a number > 0 (per flying hour)"))
-        columns["hours"].append(reader.take(row, where, "hours", _is_natural, "an integer >= 0"))
-        columns["landings"].append(reader.take(row, where, "landings", _is_natural, "an integer >= 0"))
+        columns["hours"].append(reader.take(row, where, "hours", _is_natural, f"an integer in [0, {MOST}]"))
+        columns["landings"].append(reader.take(row, where, "landings", _is_natural, f"an integer in [0, {MOST}]"))
         columns["broken"].append(reader.take(row, where, "broken", lambda v: isinstance(v, bool), "true or false"))
     return AirmeInstance(n_crews=crews, types=types, **{name: np.array(rows) for name, rows in columns.items()})
 
@@ -197,25 +200,28 @@ class _Reader:
 
 
 def _read_type(reader: _Reader, where: str, row: Any) -> AircraftType:
-    values: dict[str, Any] = {}
-    for field in fields(AircraftType):
-        if field.name == "name":
-            good, expected = (lambda v: isinstance(v, str) and v != ""), "a name"
-        elif field.name in ("hour_norm", "usage"):
-            good, expected = _is_number, "a number"
-        else:
-            good, expected = (lambda v: isinstance(v, list) and len(v) > 0 and all(map(_is_number, v))), "numbers"
-        value = reader.take(row, where, field.name, good, expected)
-        values[field.name] = tuple(float(v) for v in value) if isinstance(value, list) else value
-    reader.check(f"{where}.income", values["income"], len(values["income"]) == 2, "two numbers")
-    try:
-        return AircraftType(**values)
-    except InvalidOptionError as error:
-        raise InvalidFileError(reader.path, where, str(error)) from error
+    def numbers(field: str, expected: str, good: Callable[[list[float]], bool]) -> tuple[float, ...]:
+        def fits(value: Any) -> bool:
+            return isinstance(value, list) and all(map(_is_number, value)) and good(value)
+
+        return tuple(reader.take(row, where, field, fits, expected))
+
+    name = reader.take(row, where, "name", lambda v: isinstance(v, str) and v != "", "a name")
+    scales = numbers("scales", "numbers > 0, one for each part", lambda v: len(v) > 0 and min(v) > 0)
+    low, high = numbers("income", "bounds 0 < low <= high", lambda v: len(v) == 2 and 0 < v[0] <= v[1])
+    return AircraftType(
+        name=name,
+        scales=scales,
+        shapes=numbers("shapes", f"{len(scales)} numbers > 0", lambda v: len(v) == len(scales) and min(v) > 0),
+        hour_norm=reader.take(row, where, "hour_norm", _is_positive, "a number > 0"),
+        usage=reader.take(row, where, "usage", lambda v: _is_number(v) and 0 <= v <= 1, "a probability in [0, 1]"),
+        income=(low, high),
+    )
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
+    # The comparison is exact for JSON's unbounded integers, and false for NaN.
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
 def _is_positive(value: Any) -> bool:
@@ -223,7 +229,7 @@ def _is_positive(value: Any) -> bool:
 
 
 def _is_natural(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**31
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= MOST
 
 
 def _is_count(value: Any) -> bool:
