@@ -21,7 +21,7 @@ import numpy as np
 
 from marl_sched.agents.base import Scheduler
 from marl_sched.domain import Domain
-from marl_sched.errors import InvalidOptionError, UnknownNameError
+from marl_sched.errors import InvalidOptionError, require
 from marl_sched.graph import VISIBLE_SHARE
 from marl_sched.simulation import TurnSimulator
 from marl_sched.statistics import Summary, paired_difference, percent_gain, summarise
@@ -256,9 +256,7 @@ def evaluate(
     if not schedulers:
         raise InvalidOptionError("schedulers: expected at least one")
     known = [*schedulers, *([reference.name] if reference is not None else [])]
-    baseline = baseline or known[-1 if reference is not None else 0]
-    if baseline not in known:
-        raise UnknownNameError("baseline (one of the schedulers)", baseline, known)
+    baseline = require("baseline", baseline or known[-1 if reference is not None else 0], known)
     settings = settings.filled_in(domain)
 
     def play(name: str, scheduler: Scheduler, settings: Settings) -> Scores:

@@ -1,0 +1,83 @@
+"""The application: its commands, and how it ends when something is wrong."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import typer
+
+from marl_sched.cli import deployment, evaluation, information, problems, training
+from marl_sched.errors import MarlSchedError
+
+app = typer.Typer(
+    name="marl-sched",
+    help="Schedulers that decide for themselves: generate problems, train, evaluate, deploy as processes.",
+    context_settings={"help_option_names": ["-h", "--help"]},
+    add_completion=False,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+)
+for group in (problems, evaluation, training, deployment, information):
+    group.add_to(app)
+
+# Newer typer ships click inside itself, older ones depend on it: the base of all its errors of usage is reached
+# through the one that both export.
+_UsageError = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
+
+# The optional dependencies by the module that is missing without them.
+EXTRAS = {
+    "torch": "train",
+    "torchrl": "train",
+    "tensordict": "train",
+    "safetensors": "train",
+    "hydra": "train",
+    "omegaconf": "train",
+    "tensorboard": "train",
+    "zenoh": "deploy",
+    "ortools": "solvers",
+    "matplotlib": "plots",
+}
+
+
+@app.callback(invoke_without_command=True)
+def root(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Print the version and leave.")] = False,
+) -> None:
+    """What happens before any command."""
+    if version:
+        import marl_sched
+
+        typer.echo(f"marl-sched {marl_sched.__version__}")
+        raise typer.Exit
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
+def run(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; the exit code. See `marl_sched.cli.main`."""
+    try:
+        code = app(args=None if arguments is None else list(arguments), standalone_mode=False)
+    except _UsageError as error:
+        return _refuse(error.format_message())
+    except MarlSchedError as error:
+        return _refuse(str(error))
+    except ModuleNotFoundError as error:
+        extra = EXTRAS.get((error.name or "").partition(".")[0])
+        if extra is None:
+            raise
+        return _refuse(f"this needs {error.name}, which is not installed: pip install 'marl-sched[{extra}]'")
+    except OSError as error:
+        if error.filename is None:
+            raise
+        return _refuse(f"{error.filename}: {error.strerror}")
+    except (KeyboardInterrupt, typer.Abort):
+        return 130
+    return code if isinstance(code, int) else 0
+
+
+def _refuse(message: str) -> int:
+    print("error: " + " ".join(message.split()), file=sys.stderr)
+    return 2

@@ -1,0 +1,183 @@
+"""`marl-sched world`, `agent` and `deploy`: the plant, one agent, or all of them as processes of this machine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from marl_sched.cli import options
+from marl_sched.cli.grouped import takes
+from marl_sched.errors import InvalidOptionError
+
+if TYPE_CHECKING:
+    from marl_sched.comms.options import WorldOptions
+
+_PROBLEM = "--env airme --scale small --seed 1 --hours 720 --view local --reach 1 --comm 1"
+
+Policy = Annotated[str, typer.Option("--policy", help="A rule's or shipped policy's name, or a checkpoint's path.")]
+Json = options.JsonFile
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register this file's commands."""
+    app.command(epilog=f"Example: marl-sched world {_PROBLEM} --listen tcp/127.0.0.1:7447 --json run.json")(
+        takes(Plant)(world)
+    )
+    app.command(epilog="Example: marl-sched agent --agent 3 --policy condition --connect tcp/127.0.0.1:7447")(agent)
+    app.command(
+        epilog=f"Example: marl-sched deploy {_PROBLEM} --policy airme-local-profit --agent-policy crew_3=condition "
+        "--json run.json"
+    )(takes(Plant)(deploy))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plant:
+    """What `world` and `deploy` are told of the problem and of the run; each field is an option."""
+
+    env: options.Env = "airme"
+    scale: options.Scale = "small"
+    instance: Annotated[
+        Path | None,
+        typer.Option("--instance", metavar="FILE", help="An instance file (default: the first that the seed draws)."),
+    ] = None
+    seed: options.Seed = 0
+    hours: options.Hours = None
+    objective: Annotated[str | None, typer.Option("--objective", help="Default: the environment's first.")] = None
+    view: options.View = "full"
+    reach: options.Reach = None
+    comm: options.Comm = None
+    staleness: options.Staleness = None
+    run: Annotated[str, typer.Option("--run", help="The run's name, by which its processes find each other.")] = "run"
+    deadline: Annotated[float, typer.Option("--deadline", help="Seconds that a decision may take.")] = 2.0
+    patience: Annotated[
+        int, typer.Option("--patience", help="Missed deadlines in a row after which an agent counts as dead.")
+    ] = 3
+    ready_timeout: Annotated[
+        float, typer.Option("--ready-timeout", help="Seconds to wait for all agents at the start.")
+    ] = 60.0
+
+    def world_options(self, listen: str, json: Path | None) -> WorldOptions:
+        """These options as the world process takes them; typed errors for words that stand for nothing."""
+        from marl_sched.comms.options import WorldOptions
+        from marl_sched.domain import get_domain
+
+        options.check_output(json)
+        given = {name: getattr(self, name) for name in options.VIEW_OPTIONS if getattr(self, name) is not None}
+        options.build_view(get_domain(self.env), self.view, given)
+        return WorldOptions(
+            env=self.env,
+            scale="" if self.instance else self.scale,
+            instance=str(self.instance or ""),
+            seed=self.seed,
+            hours=self.hours or 0,
+            objective=self.objective or "",
+            view=self.view,
+            view_options=given,
+            run=self.run,
+            listen=listen,
+            deadline=self.deadline,
+            patience=self.patience,
+            ready_timeout=self.ready_timeout,
+            report=str(json or ""),
+        )
+
+
+def world(
+    plant: Plant,
+    *,
+    listen: Annotated[
+        str, typer.Option("--listen", metavar="ENDPOINT", help="Where to listen for agents.")
+    ] = "tcp/127.0.0.1:7447",
+    json: Json = None,
+) -> None:
+    """Be the plant of a run: own the simulator, tell what happens, apply the agents' decisions."""
+    from marl_sched.comms.world import serve
+
+    with progress_bar() as tell:
+        report = serve(plant.world_options(listen, json), tell)
+    print_report(report)
+
+
+def agent(
+    agent: Annotated[int, typer.Option("--agent", metavar="I", help="Index of the agent to be.")],
+    policy: Policy,
+    run: Annotated[str, typer.Option("--run", help="The world's run.")] = "run",
+    connect: Annotated[
+        str, typer.Option("--connect", metavar="ENDPOINT", help="Where the world listens.")
+    ] = "tcp/127.0.0.1:7447",
+    join_timeout: Annotated[float, typer.Option("--join-timeout", help="Seconds to wait for the world.")] = 60.0,
+) -> None:
+    """Be one agent of a run: see through its view and decide with its policy."""
+    from marl_sched.comms.agent import run as be_agent
+    from marl_sched.comms.options import AgentOptions
+
+    be_agent(AgentOptions(agent=agent, policy=policy, run=run, connect=connect, join_timeout=join_timeout))
+
+
+def deploy(
+    plant: Plant,
+    *,
+    policy: Policy,
+    agent_policy: Annotated[
+        list[str] | None,
+        typer.Option("--agent-policy", metavar="AGENT=POLICY", help="Another policy for one agent; may be repeated."),
+    ] = None,
+    listen: Annotated[
+        str, typer.Option("--listen", metavar="ENDPOINT", help="Where the world listens; port 0: a free one.")
+    ] = "tcp/127.0.0.1:0",
+    json: Json = None,
+) -> None:
+    """Start the plant and one process for each agent, watch over them, and report what they did."""
+    from marl_sched.comms.launcher import deploy as launch
+    from marl_sched.comms.options import DeployOptions
+
+    chosen = DeployOptions(
+        world=plant.world_options(listen, json), policy=policy, agent_policies=_by_agent(agent_policy or [])
+    )
+    with progress_bar() as tell:
+        report = launch(chosen, tell)
+    print_report(report)
+
+
+@contextmanager
+def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
+    """A bar on stderr, where there is a terminal, that follows (phase, simulated time, horizon)."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task("starting", total=None)
+
+        def tell(phase: str, moment: int, horizon: int) -> None:
+            progress.update(task, description=phase, completed=moment, total=horizon or None)
+
+        yield tell
+
+
+def print_report(report: dict[str, Any]) -> None:
+    """The end of a run in a few lines."""
+    latency, messages = report["latency_ms"], report["messages"]
+    typer.echo(f"{report['hours']} hours, {len(report['agents'])} agents, {len(report['decisions'])} decisions")
+    typer.echo(f"M1 ({report['objective']}): {report['M1']:.4f}")
+    typer.echo(f"{messages['count']} messages, {messages['bytes']} bytes")
+    if latency["p50"] is not None:
+        typer.echo(f"decision latency: p50 {latency['p50']:.2f} ms, p99 {latency['p99']:.2f} ms")
+    for death in report["deaths"]:
+        where = ", ".join(f"{name} {value}" for name, value in death.items())
+        typer.echo(f"lost: {where}")
+
+
+def _by_agent(pairs: list[str]) -> dict[str, str]:
+    policies = {}
+    for pair in pairs:
+        agent, found, policy = pair.partition("=")
+        if not found or not agent or not policy:
+            raise InvalidOptionError(f"--agent-policy: expected AGENT=POLICY such as crew_3=condition, got {pair!r}")
+        policies[agent] = policy
+    return policies

@@ -1,0 +1,116 @@
+"""`marl-sched evaluate`, `compare` and `bench`: schedulers held against each other, and how fast everything is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from marl_sched.cli import options
+from marl_sched.cli.grouped import takes
+from marl_sched.cli.selection import Resolved, Selection
+
+_SELECTORS = (
+    "--env airme --scale small --instances 100 --episodes 10 --schedulers corrective,condition,preventive-first"
+)
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register this file's commands."""
+    app.command(epilog=f"Example: marl-sched evaluate {_SELECTORS} --view local --reach 1 --json results.json")(
+        takes(Selection)(evaluate)
+    )
+    app.command(epilog=f"Example: marl-sched compare {_SELECTORS} --out out/compare")(takes(Selection)(compare))
+    app.command(epilog="Example: marl-sched bench --env airme --json bench.json")(bench)
+
+
+def evaluate(selection: Selection, *, json: options.JsonFile = None) -> None:
+    """Play schedulers on the same instances with the same noise and print their scores."""
+    from marl_sched.cli.tables import print_scores
+    from marl_sched.files import write_json
+
+    options.check_output(json)
+    results = play(selection.resolve(), selection.baseline)
+    if json is not None:
+        write_json(json, results)
+    print_scores(results)
+
+
+def compare(
+    selection: Selection,
+    *,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results and the plots.")],
+    json: options.JsonFile = None,
+    log: Annotated[
+        list[Path] | None, typer.Option("--log", metavar="CSV", help="A training log to plot; may be repeated.")
+    ] = None,
+) -> None:
+    """As evaluate, and draw the scores, an episode of every scheduler and the learning curves of training logs."""
+    from marl_sched.cli.tables import print_scores
+    from marl_sched.files import write_json
+    from marl_sched.train.compare import draw_learning_curves, draw_scores, draw_timelines
+
+    options.check_folder(out)
+    options.check_output(json)
+    if log:  # first, as a log may be malformed
+        typer.echo(draw_learning_curves(log, out / "learning.png"))
+    resolved = selection.resolve()
+    results = play(resolved, selection.baseline)
+    for path in (out / "results.json", json):
+        if path is not None:
+            write_json(path, results)
+    print_scores(results)
+    typer.echo(out / "results.json")
+    typer.echo(draw_scores(results, out / "scores.png"))
+    shown = (resolved.domain, resolved.schedulers, resolved.instances[0], resolved.settings)
+    typer.echo(draw_timelines(*shown, out / "timelines.png"))
+
+
+def play(resolved: Resolved, baseline: str | None) -> dict[str, Any]:
+    """Evaluate what was selected, with a progress bar on stderr where there is a terminal; schema 1."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from marl_sched.agents.registry import create_scheduler
+    from marl_sched.train.evaluate import REFERENCE, evaluate
+
+    domain = resolved.domain
+    reference = domain.extras.get(REFERENCE)
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+        tasks: dict[str, Any] = {}
+
+        def tell(name: str, done: float) -> None:
+            if name not in tasks:
+                tasks[name] = progress.add_task(name, total=1.0)
+            progress.update(tasks[name], completed=done)
+
+        table = evaluate(
+            domain,
+            resolved.schedulers,
+            resolved.instances,
+            resolved.settings,
+            reference=create_scheduler(reference, domain) if reference else None,
+            baseline=baseline,
+            progress=tell,
+        )
+        return table.as_json()
+
+
+def bench(
+    env: options.Env = "airme",
+    json: options.JsonFile = None,
+    repeats: Annotated[int, typer.Option("--repeats", min=1, help="Measurements; the median is reported.")] = 5,
+) -> None:
+    """Measure how fast the simulator, its faces and the policy are on this machine, on one thread."""
+    from marl_sched.cli.tables import print_bench
+    from marl_sched.domain import get_domain
+    from marl_sched.files import write_json
+    from marl_sched.train.bench import bench as measure
+
+    options.check_output(json)
+    figures = measure(get_domain(env), repeats=repeats)
+    if json is not None:
+        write_json(json, figures)
+    print_bench(figures)

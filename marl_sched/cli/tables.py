@@ -1,0 +1,74 @@
+"""Results as tables on a terminal, drawn from the same JSON that files hold."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+_WIDE = 110  # columns of a terminal
+
+
+def print_scores(results: dict[str, Any]) -> None:
+    """The table of `marl-sched evaluate`: a row per scheduler, best mean first; a narrow terminal gets less of it."""
+    console = Console()
+    measures = _other_measures(results) if console.width >= _WIDE else []
+    table = Table(title=_title(results), caption=_caption(results), show_lines=False, box=box.SIMPLE_HEAD)
+    table.add_column("scheduler", overflow="fold")
+    gain = ["M2 %"] if "reference" in results else []
+    for heading in ("M1", "IQM", f"less {results['baseline']}", *gain, *measures):
+        table.add_column(heading, justify="right", min_width=7)
+    for name, row in sorted(results["schedulers"].items(), key=lambda item: -item[1]["M1"]["mean"]):
+        m1, difference = row["M1"], row["difference"]
+        cells = [
+            f"{m1['mean']:.4f}\n± {m1['std']:.3f}",
+            f"{m1['iqm']:.4f}\n{_interval(m1['ci95'])}",
+            f"{difference['mean']:+.4f}\n{_interval(difference['ci95'])}",
+        ]
+        cells += [f"{row[name]['mean']:.1f}\n± {row[name]['std']:.1f}" for name in ("M2",) if gain]
+        cells += [f"{row[measure]['mean']:.4f}\n± {row[measure]['std']:.3f}" for measure in measures]
+        table.add_row(f"{name}\n({row['needs']})" if row["needs"] else name, *cells)
+    console.print(table)
+
+
+def _title(results: dict[str, Any]) -> str:
+    scale = results["scale"] or "given"
+    return f"{results['env']}, {scale} instances: M1 is mean {results['objective']} over {results['hours']} hours"
+
+
+def _caption(results: dict[str, Any]) -> str:
+    view = dict(results["view"])
+    kind, share = view.pop("kind"), view.pop("visible_share")
+    seen = " ".join([kind, *(f"{name} {value}" for name, value in view.items())])
+    return (
+        f"{results['instances']} instances x {results['episodes']} episodes, seed {results['seed']}; view {seen}, "
+        f"{100 * share:.0f} % of the graph seen. ±: over instances; [ ]: 95 percent intervals, of the difference paired"
+    )
+
+
+def print_bench(figures: dict[str, Any]) -> None:
+    """The figures of `marl-sched bench`, one a line."""
+    table = Table("figure", "value", title=f"bench {figures['env']}, {figures['threads']} thread")
+    for name, value in figures.items():
+        if isinstance(value, dict):
+            for part, number in value.items():
+                table.add_row(f"{name}.{part}", _number(number))
+        else:
+            table.add_row(name, _number(value))
+    Console().print(table)
+
+
+def _other_measures(results: dict[str, Any]) -> list[str]:
+    row = next(iter(results["schedulers"].values()))
+    known = ("M1", "M2", "difference", results["objective"])
+    return [name for name, value in row.items() if isinstance(value, dict) and name not in known]
+
+
+def _interval(bounds: list[float] | None) -> str:
+    return "" if bounds is None else f"[{bounds[0]:.3f}, {bounds[1]:.3f}]"
+
+
+def _number(value: Any) -> str:
+    return f"{value:,.2f}" if isinstance(value, float) else str(value)
