@@ -119,7 +119,7 @@ class AirmeSimulator(TurnSimulator):
         if instances is not None:
             for b, instance in zip(chosen, instances, strict=True):
                 self.instances[b] = instance
-        self._cover_counters()
+        self._cover_counters([self.instances[b] for b in chosen])
         if seed is not None:
             self._seeds[chosen] = seed
             self._episodes[chosen] = 0
@@ -130,9 +130,9 @@ class AirmeSimulator(TurnSimulator):
         for b in chosen:
             self._start(int(b))
 
-    def _cover_counters(self) -> None:
-        """Make the failure table reach every counter that an episode can reach."""
-        longest = max(int(max(i.hours.max(), i.landings.max())) for i in self.instances) + self.horizon
+    def _cover_counters(self, instances: Sequence[AirmeInstance]) -> None:
+        """Make the failure table reach every counter that an episode of these instances can reach."""
+        longest = max((int(max(i.hours.max(), i.landings.max())) for i in instances), default=0) + self.horizon
         if self.rules.failure.shape[2] <= longest:
             table = failure_table(self.types, longest, self.failure)
             self.rules = self.rules._replace(failure=table)
@@ -184,8 +184,9 @@ class AirmeSimulator(TurnSimulator):
         targets = np.asarray(targets, np.int64)
         if targets.shape != shape:
             raise IllegalActionError(f"targets: expected shape {shape}, got {targets.shape}")
-        if targets.min() < 0 or targets.max() >= self.max_targets:
-            bad = int(targets.min()) if targets.min() < 0 else int(targets.max())
+        outside = dynamics.first_outside(targets.ravel(), self.max_targets)
+        if outside >= 0:
+            bad = targets.ravel()[outside]
             raise IllegalActionError(f"target {bad}: expected a plane's slot in [0, {self.max_targets - 1}]")
         return targets
 
