@@ -106,9 +106,7 @@ class HetGATCritic(nn.Module):
         extra: number of inputs beside the graph, which enter the state's term.
     """
 
-    def __init__(
-        self, spec: GraphSpec, *, width: int = 8, heads: int = 4, layers: int = 2, extra: int = 0
-    ) -> None:
+    def __init__(self, spec: GraphSpec, *, width: int = 8, heads: int = 4, layers: int = 2, extra: int = 0) -> None:
         super().__init__()
         self.spec = spec
         names = [node.name for node in spec.nodes]

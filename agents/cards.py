@@ -1,0 +1,119 @@
+"""The card of a trained policy: what it decides, on what it was trained, and how well it did.
+
+A card is the JSON file beside the weights. It holds the metagraph that the network was built for, so a
+policy can be rebuilt without its domain, and is refused where a domain's graph has become another.
+"""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta, Struct
+
+from marl_sched.errors import InvalidFileError
+from marl_sched.files import read_json, write_json
+from marl_sched.graph import STATE, GraphSpec
+
+SCHEMA = 1
+Positive = Annotated[int, Meta(ge=1)]
+
+
+class Sizes(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Sizes of a HetGAT network: features per head, heads per layer, layers."""
+
+    width: Positive
+    heads: Positive
+    layers: Positive
+
+
+class PolicyCard(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What the weights beside it are.
+
+    Attributes:
+        domain: the environment's name.
+        objective: the reward it was trained for.
+        view: what an agent saw in training: `{"kind": "local", "reach": 1, ...}`.
+        graph: node types with the names of their features, relations, and what is decided on.
+        sizes: of the network.
+        command: the exact command that trained it.
+        git_hash: the source that the command ran on, see `source_revision`.
+        seed: of the training run.
+        scores: measured, for example `{"small": {"M1": 0.7, "instances": 100, "episodes": 10}}`.
+        training_knowledge: what training used beyond the view, such as a critic on the full graph; the
+            policy itself sees its view and nothing else.
+        weights_sha256: of the safetensors file.
+        schema: of this card.
+    """
+
+    domain: str
+    objective: str
+    view: dict[str, Any]
+    graph: GraphSpec
+    sizes: Sizes
+    command: str
+    git_hash: str
+    seed: int
+    scores: dict[str, Any]
+    training_knowledge: str = ""
+    weights_sha256: str = ""
+    schema: Literal[1] = SCHEMA
+
+
+def write_card(path: str | Path, card: PolicyCard) -> None:
+    """Write a card as JSON, whole or not at all."""
+    write_json(path, msgspec.to_builtins(card))
+
+
+def read_card(path: str | Path) -> PolicyCard:
+    """The card in a JSON file; InvalidFileError names the field that is not as expected."""
+    try:
+        return msgspec.convert(read_json(path), PolicyCard)
+    except msgspec.ValidationError as error:
+        reason, _, where = str(error).partition(" - at `$")
+        field = where.strip("`.") or "card"
+        raise InvalidFileError(path, field, f"a policy card of schema {SCHEMA} ({reason})") from error
+
+
+def check_graph(path: str | Path, card: PolicyCard, graph: GraphSpec) -> None:
+    """Raise InvalidFileError, which says where they differ, unless a policy was trained on this metagraph."""
+    if card.graph == graph:
+        return
+    ours, theirs = _features(card.graph), _features(graph)
+    for name in ours | theirs:
+        if ours.get(name) != theirs.get(name):
+            _refuse(path, f"features of {name!r}", theirs.get(name), ours.get(name))
+    _refuse(path, "relations", _relations(graph), _relations(card.graph))
+
+
+def source_revision() -> str:
+    """The git commit of the running source, with `-dirty` after it if files differ, or "" outside a checkout."""
+    here = Path(__file__).resolve().parent
+    command = ["git", "-C", str(here), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    try:
+        found = subprocess.run(command, capture_output=True, text=True, check=False)
+    except FileNotFoundError:  # git itself is not installed
+        return ""
+    return found.stdout.strip() if found.returncode == 0 else ""
+
+
+def _features(graph: GraphSpec) -> dict[str, tuple[str, ...]]:
+    return {**{node.name: node.features for node in graph.nodes}, STATE: graph.state_features}
+
+
+def _relations(graph: GraphSpec) -> Mapping[str, Any]:
+    described = msgspec.to_builtins(graph)
+    return {"decision_of": described["decision_of"], "relations": described["relations"]}
+
+
+def _refuse(path: str | Path, what: str, expected: Any, got: Any) -> None:
+    """Name what only one side has; both sides in full would not fit a line."""
+    if isinstance(expected, tuple) and isinstance(got, tuple):
+        missing = [name for name in expected if name not in got]
+        unknown = [name for name in got if name not in expected]
+        detail = f"{len(expected)} features of the environment's graph (the policy lacks {missing}, knows {unknown})"
+        raise InvalidFileError(path, what, detail, f"{len(got)}")
+    raise InvalidFileError(path, what, "those of the environment's graph", got)

@@ -1,0 +1,146 @@
+"""Policies as files: what is written is what is read, and nothing else is."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+import torch
+
+from marl_sched.agents.cards import PolicyCard, Sizes, check_graph, read_card, source_revision
+from marl_sched.agents.hetgat.checkpoint import load_network, save_network
+from marl_sched.agents.hetgat.network import HetGATNetwork
+from marl_sched.agents.hetgat.policy import HetGATPolicy
+from marl_sched.errors import InvalidFileError
+from marl_sched.graph import NodeType
+
+
+@pytest.fixture
+def network(graph) -> HetGATNetwork:
+    torch.manual_seed(0)
+    return HetGATNetwork(graph, width=3, heads=2, layers=2)
+
+
+def card_of(network: HetGATNetwork) -> PolicyCard:
+    return PolicyCard(
+        domain="airme",
+        objective="profit",
+        view={"kind": "local", "reach": 1, "comm": 1, "staleness": 0},
+        graph=network.spec,
+        sizes=Sizes(**network.sizes),
+        command="marl-sched train env=airme view=local seed=7",
+        git_hash=source_revision(),
+        seed=7,
+        scores={"small": {"M1": 0.69, "instances": 100, "episodes": 10}},
+    )
+
+
+@pytest.fixture
+def saved(network, tmp_path) -> Path:
+    path = tmp_path / "mine.safetensors"
+    save_network(path, network, card_of(network))
+    return path
+
+
+def test_a_checkpoint_comes_back_as_it_was(network, saved, sizes, observe):
+    observation = observe(network.spec, sizes)
+    for path in (saved, saved.with_suffix(".json")):
+        again, card = load_network(path)
+        assert torch.equal(again(observation), network(observation))
+        assert msgspec.structs.replace(card, weights_sha256="") == card_of(network)
+        assert again.spec == network.spec
+    policy = HetGATPolicy.load(saved, graph=network.spec)
+    assert policy.name == "mine"
+    assert policy.choose({name: v.numpy() for name, v in observation.items()}, np.zeros(3)).shape == (3,)
+
+
+def test_saving_leaves_two_files_and_no_temporary_one(saved):
+    assert sorted(path.name for path in saved.parent.iterdir()) == ["mine.json", "mine.safetensors"]
+
+
+@pytest.mark.parametrize("kept", [0, 7, 100, -1])
+def test_a_truncated_weights_file_is_refused(saved, kept: int):
+    saved.write_bytes(saved.read_bytes()[:kept])
+    with pytest.raises(InvalidFileError, match=r"mine\.safetensors: expected a whole safetensors file"):
+        load_network(saved)
+
+
+def test_a_truncated_card_is_refused(saved):
+    card = saved.with_suffix(".json")
+    card.write_bytes(card.read_bytes()[:200])
+    with pytest.raises(InvalidFileError, match=r"mine\.json: line \d+ column \d+: expected valid JSON"):
+        load_network(saved)
+
+
+def test_a_missing_file_is_named(saved):
+    saved.unlink()
+    with pytest.raises(InvalidFileError, match=r"mine\.safetensors: expected a readable file \(No such file"):
+        load_network(saved)
+
+
+def test_weights_of_another_card_are_refused(network, saved):
+    other = saved.with_name("other.safetensors")
+    with torch.no_grad():
+        network.readout.bias.add_(1)
+    save_network(other, network, card_of(network))
+    other.replace(saved)
+    with pytest.raises(InvalidFileError, match="expected the weights of its card"):
+        load_network(saved)
+
+
+def test_a_pickle_is_not_loaded(saved, tmp_path):
+    marker = tmp_path / "executed"
+
+    class Malice:
+        def __reduce__(self):
+            return Path.touch, (marker,)
+
+    torch.save({"weights": Malice()}, saved)
+    with pytest.raises(InvalidFileError, match="expected a whole safetensors file"):
+        load_network(saved)
+    assert not marker.exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"schema": 2}, r"mine\.json: \.?schema: expected a policy card of schema 1 \(Invalid enum value 2"),
+        ({"sizes": {"width": 0, "heads": 2, "layers": 2}}, r"sizes\.width: .*`int` >= 1"),
+        ({"colour": "red"}, r"contains unknown field `colour`"),
+        ({"seed": "seven"}, r"seed: .*Expected `int`, got `str`"),
+    ],
+)
+def test_a_malformed_card_names_the_field(saved, change, message: str):
+    card = saved.with_suffix(".json")
+    card.write_text(json.dumps({**json.loads(card.read_text()), **change}))
+    with pytest.raises(InvalidFileError, match=message):
+        read_card(card)
+
+
+def test_a_card_of_other_sizes_than_the_weights_names_the_tensor(saved):
+    card = saved.with_suffix(".json")
+    content = json.loads(card.read_text())
+    content["sizes"]["width"] = 4
+    card.write_text(json.dumps(content))
+    with pytest.raises(InvalidFileError, match=r"expected torch.float32 of shape .*, got 'torch.float32 of shape"):
+        load_network(saved)
+
+
+def test_a_policy_for_other_features_is_refused_by_name(network, saved):
+    first = network.spec.nodes[0]
+    renamed = replace(
+        network.spec, nodes=(NodeType(first.name, ("rust", *first.features[1:])), *network.spec.nodes[1:])
+    )
+    with pytest.raises(InvalidFileError, match=rf"features of '{first.name}': .*lacks \['rust'\]"):
+        HetGATPolicy.load(saved, graph=renamed)
+
+
+def test_a_policy_for_other_relations_is_refused(network, saved):
+    fewer = replace(network.spec, relations=network.spec.relations[1:])
+    with pytest.raises(InvalidFileError, match="relations: expected those of the environment's graph"):
+        HetGATPolicy.load(saved, graph=fewer)
+    check_graph(saved, read_card(saved.with_suffix(".json")), network.spec)

@@ -1,0 +1,134 @@
+"""A network as a scheduler: how it picks, and what it refuses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import chisquare
+
+from marl_sched.agents.hetgat.network import HetGATNetwork
+from marl_sched.agents.hetgat.policy import HetGATPolicy, inverse_distribution
+from marl_sched.errors import InvalidOptionError
+from marl_sched.graph import ACTION_MASK
+
+SIZES = {"plane": 9, "crew": 4}
+LOWEST = np.finfo(np.float32).min
+
+
+@pytest.fixture
+def network(fleet) -> HetGATNetwork:
+    torch.manual_seed(0)
+    network = HetGATNetwork(fleet)
+    torch.nn.init.normal_(network.readout.weight)
+    return network
+
+
+@pytest.fixture
+def observation(fleet, observe) -> dict[str, np.ndarray]:
+    return {name: values.numpy() for name, values in observe(fleet, SIZES, batch=7).items()}
+
+
+def row_of(observation, b: int) -> dict[str, np.ndarray]:
+    return {name: values[b] for name, values in observation.items()}
+
+
+def test_greedy_takes_the_most_probable_legal_target(network, observation):
+    policy = HetGATPolicy(network)
+    targets = policy.choose(observation, np.zeros(7))
+    assert targets.dtype == np.int64
+    assert (observation[ACTION_MASK][np.arange(7), targets] == 1).all()
+    assert (targets == policy.logits(observation).argmax(1)).all()
+
+
+def test_greedy_ties_go_to_the_lowest_index(network, observation):
+    torch.nn.init.zeros_(network.readout.weight)
+    assert (HetGATPolicy(network).choose(observation, np.full(7, 0.9)) == 0).all()
+
+
+def test_sampling_follows_the_distribution(network, observation):
+    policy = HetGATPolicy(network, mode="sample")
+    count = 20_000
+    many = {name: np.repeat(values[:1], count, axis=0) for name, values in observation.items()}
+    picks = policy.choose(many, np.random.default_rng(0).random(count))
+    probabilities = torch.from_numpy(policy.logits(row_as_batch(observation, 0)))[0].double().softmax(0).numpy()
+    legal = probabilities > 0
+    assert legal.sum() > 3
+    assert probabilities[legal].max() < 0.9
+    counts = np.bincount(picks, minlength=SIZES["plane"])
+    assert counts[~legal].sum() == 0
+    assert chisquare(counts[legal], count * probabilities[legal] / probabilities[legal].sum()).pvalue > 1e-3
+
+
+def row_as_batch(observation, b: int) -> dict[str, np.ndarray]:
+    return {name: values[b : b + 1] for name, values in observation.items()}
+
+
+def test_sampling_is_a_function_of_observation_and_uniform(network, observation):
+    policy, again = HetGATPolicy(network, mode="sample"), HetGATPolicy(network, mode="sample")
+    uniform = np.linspace(0.0, 0.999, 7)
+    first = policy.choose(observation, uniform)
+    torch.rand(5)
+    assert (again.choose(observation, uniform) == first).all()
+
+
+@pytest.mark.parametrize(
+    ("uniform", "target"), [(0.0, 1), (0.2499, 1), (0.25, 3), (0.7499, 3), (0.75, 4), (np.nextafter(1.0, 0.0), 4)]
+)
+def test_inverse_distribution_by_hand(uniform: float, target: int):
+    """Probabilities 0, 1/4, 0, 1/2, 1/4 and 0."""
+    logits = np.array([[LOWEST, 0.0, LOWEST, np.log(2.0), 0.0, LOWEST]])
+    assert inverse_distribution(logits, np.array([uniform])) == [target]
+
+
+def test_one_agent_chooses_what_it_would_choose_in_a_batch_of_one(network, observation):
+    policy = HetGATPolicy(network, mode="sample")
+    for b in range(7):
+        row = row_of(observation, b)
+        mask = row.pop(ACTION_MASK)
+        as_pettingzoo = {"observation": row, "action_mask": mask}
+        batched = policy.choose(row_as_batch(observation, b), np.array([0.3]))
+        assert policy.act(as_pettingzoo, uniform=0.3) == batched[0]
+        assert policy.act({**row, ACTION_MASK: mask}, uniform=0.3) == batched[0]
+
+
+def test_a_single_decision_is_bit_equal_when_it_is_repeated(network, observation):
+    policy = HetGATPolicy(network)
+    first = policy.logits(row_as_batch(observation, 2))
+    for _ in range(20):
+        assert (policy.logits(row_as_batch(observation, 2)) == first).all()
+    np.testing.assert_allclose(policy.logits(observation)[2], first[0], rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.filterwarnings("error")
+def test_read_only_arrays_as_a_message_holds_them_are_accepted(network, observation):
+    frozen = {name: np.frombuffer(v.tobytes(), v.dtype).reshape(v.shape) for name, v in observation.items()}
+    assert not frozen["plane"].flags.writeable
+    policy = HetGATPolicy(network)
+    assert (policy.choose(frozen, np.zeros(7)) == policy.choose(observation, np.zeros(7))).all()
+
+
+def test_a_policy_keeps_the_weights_it_was_made_with(network, observation):
+    policy = HetGATPolicy(network)
+    before = policy.logits(observation)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.zero_()
+    assert (policy.logits(observation) == before).all()
+
+
+def test_an_observation_of_another_graph_is_refused(network, observation):
+    observation["plane"] = observation["plane"][..., :-1]
+    with pytest.raises(InvalidOptionError, match=r"plane: policy hetgat expects 5 features, got shape \(7, 9, 4\)"):
+        HetGATPolicy(network).choose(observation, np.zeros(7))
+
+
+def test_a_missing_array_is_refused(network, observation):
+    del observation["state"]
+    with pytest.raises(InvalidOptionError, match="observation: state: policy hetgat expects 4 features"):
+        HetGATPolicy(network).choose(observation, np.zeros(7))
+
+
+def test_an_unknown_mode_is_refused(network):
+    with pytest.raises(InvalidOptionError, match="expected one of greedy, sample, got 'warm'"):
+        HetGATPolicy(network, mode="warm")
