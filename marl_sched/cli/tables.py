@@ -49,14 +49,16 @@ def _caption(results: dict[str, Any]) -> str:
 
 
 def print_bench(figures: dict[str, Any]) -> None:
-    """The figures of `marl-sched bench`, one a line."""
-    table = Table("figure", "value", title=f"bench {figures['env']}, {figures['threads']} thread")
-    for name, value in figures.items():
-        if isinstance(value, dict):
-            for part, number in value.items():
-                table.add_row(f"{name}.{part}", _number(number))
-        else:
-            table.add_row(name, _number(value))
+    """The figures of `marl-sched bench`, each with what it is of."""
+    title = f"{figures['env']}: {figures['threads']} thread, {figures['statistic']} ({figures['repeats']})"
+    table = Table("figure", "value", "of", title=title, box=box.SIMPLE_HEAD)
+    for name, meaning in figures["meaning"].items():
+        value = figures[name]
+        parts = (
+            {f"{name} {part}": number for part, number in value.items()} if isinstance(value, dict) else {name: value}
+        )
+        for label, number in parts.items():
+            table.add_row(label, f"{number:,.2f}", meaning)
     Console().print(table)
 
 
@@ -68,7 +70,3 @@ def _other_measures(results: dict[str, Any]) -> list[str]:
 
 def _interval(bounds: list[float] | None) -> str:
     return "" if bounds is None else f"[{bounds[0]:.3f}, {bounds[1]:.3f}]"
-
-
-def _number(value: Any) -> str:
-    return f"{value:,.2f}" if isinstance(value, float) else str(value)

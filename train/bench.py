@@ -1,0 +1,144 @@
+"""How fast a domain's simulator, its faces and the policy are on this machine, on one thread.
+
+Every figure is the best of several repeats: what else the machine does only ever adds time. Nothing is compiled,
+drawn or decided within a measurement that is not what the measurement is of.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import torch
+
+from marl_sched.agents.hetgat.network import HetGATNetwork
+from marl_sched.agents.hetgat.policy import HetGATPolicy
+from marl_sched.agents.registry import create_scheduler
+from marl_sched.domain import Domain
+from marl_sched.envs.aec import SchedulingAEC
+from marl_sched.envs.torchrl_env import SchedulingTorchRL
+from marl_sched.errors import InvalidOptionError
+from marl_sched.graph import ACTION_MASK
+from marl_sched.simulation import TurnSimulator
+
+SCHEMA = 1
+BATCH = 1024
+_AEC_TURNS = 5_000
+_TORCHRL_STEPS = 100
+_POLICY_DECISIONS = 200
+_MEANINGS = {
+    "aec_turns_per_s": "AEC turns with observations, small instance, random legal choices: last() and step()",
+    "torchrl_decisions_per_s": f"decisions of a TorchRL batch of {BATCH} small instances with full observations, "
+    "random legal choices: rand_action() and step_and_maybe_reset()",
+    "policy_ms": "one decision of the default HetGAT policy at batch size 1 with a full view, observing included",
+}
+
+
+def bench(domain: Domain, *, repeats: int = 5) -> dict[str, Any]:
+    """All figures of a domain, ready for JSON; `meaning` says what each of them is of. Uses one thread."""
+    if repeats < 1:
+        raise InvalidOptionError(f"repeats: expected an integer >= 1, got {repeats}")
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        own, meanings = _OWN[domain.name](domain, repeats) if domain.name in _OWN else ({}, {})
+        scales = list(domain.scales)
+        figures = {
+            **own,
+            "aec_turns_per_s": aec_turns_per_second(domain, repeats),
+            "torchrl_decisions_per_s": torchrl_decisions_per_second(domain, repeats),
+            "policy_ms": {scale: policy_milliseconds(domain, scale, repeats) for scale in (scales[0], scales[-1])},
+        }
+    finally:
+        torch.set_num_threads(threads)
+    head = {"schema": SCHEMA, "env": domain.name, "threads": 1, "repeats": repeats, "statistic": "best of repeats"}
+    return {**head, **figures, "meaning": {**meanings, **_MEANINGS}}
+
+
+def hour_microseconds(domain: Domain, batch: int, repeats: int) -> float:
+    """Microseconds per simulated hour and instance of `batch` small AirME instances played to their end."""
+    simulator, choices = _prepared_hours(domain, batch)
+    return 1e6 / (batch * len(choices)) * _best(repeats, simulator.reset, lambda: _play_hours(simulator, choices))
+
+
+def _prepared_hours(domain: Domain, batch: int) -> tuple[Any, np.ndarray]:
+    """A simulator and the condition-based rule's targets for all its hours and crews, int64 (T, B, C)."""
+    simulator: Any = domain.simulator(domain.instances("small", batch, 0), pad="small")
+    rule = create_scheduler("condition", domain)
+    choices = np.zeros((domain.default_horizon, batch, simulator.max_agents), np.int64)
+    while (rows := np.flatnonzero(simulator.acting >= 0)).size:
+        targets = rule.decide(simulator)
+        choices[simulator.time[rows], rows, simulator.acting[rows]] = targets[rows]
+        simulator.step(targets)
+    return simulator, choices
+
+
+def _play_hours(simulator: Any, choices: np.ndarray) -> None:
+    for hour in choices:
+        simulator.play_hour(hour)
+
+
+def aec_turns_per_second(domain: Domain, repeats: int) -> float:
+    """Turns of the AEC environment per second, each with an observation and a random legal choice."""
+    env = SchedulingAEC(domain)
+    uniforms = np.random.default_rng(0).random(_AEC_TURNS)
+
+    def play() -> None:
+        for uniform in uniforms:
+            observation, _, terminated, truncated, _ = env.last()
+            if terminated or truncated:
+                env.reset()
+                continue
+            legal = np.flatnonzero(observation[ACTION_MASK])
+            env.step(int(legal[int(uniform * len(legal))]))
+
+    return _AEC_TURNS / _best(repeats, lambda: env.reset(seed=0), play)
+
+
+def torchrl_decisions_per_second(domain: Domain, repeats: int) -> float:
+    """Decisions per second of a TorchRL batch that is stepped without storing a rollout."""
+    env = SchedulingTorchRL(domain, batch_size=BATCH)
+    state = {"now": env.reset()}
+
+    def play() -> None:
+        for _ in range(_TORCHRL_STEPS):
+            _, state["now"] = env.step_and_maybe_reset(env.rand_action(state["now"]))
+
+    return BATCH * _TORCHRL_STEPS / _best(repeats, lambda: None, play)
+
+
+def policy_milliseconds(domain: Domain, scale: str, repeats: int) -> float:
+    """Milliseconds of one decision of the default network, fresh, as a policy at batch size 1."""
+    simulator: TurnSimulator = domain.simulator(domain.instances(scale, 1, 0), pad=scale)
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        policy = HetGATPolicy(HetGATNetwork(simulator.graph))
+
+    def play() -> None:
+        for _ in range(_POLICY_DECISIONS):
+            simulator.step(policy.decide(simulator))
+
+    return 1e3 / _POLICY_DECISIONS * _best(repeats, simulator.reset, play)
+
+
+def _best(repeats: int, prepare: Callable[[], Any], play: Callable[[], None]) -> float:
+    """The least seconds that `play` took, after one run that does not count: it compiles and fills caches."""
+    seconds = []
+    for _ in range(repeats + 1):
+        prepare()
+        started = time.perf_counter()
+        play()
+        seconds.append(time.perf_counter() - started)
+    return min(seconds[1:])
+
+
+def _airme(domain: Domain, repeats: int) -> tuple[dict[str, float], dict[str, str]]:
+    what = "microseconds per simulated hour and small instance in play_hour(), the condition-based rule's decisions"
+    figures = {f"hour_us_b{batch}": hour_microseconds(domain, batch, repeats) for batch in (1, BATCH)}
+    return figures, dict.fromkeys(figures, f"{what} prepared beforehand")
+
+
+# What only one domain has to measure: domain -> function of (domain, repeats) -> (figures, what they are of).
+_OWN: Mapping[str, Callable[[Domain, int], tuple[dict[str, float], dict[str, str]]]] = {"airme": _airme}
