@@ -1,0 +1,181 @@
+"""The configuration of a training run: what `configs/train.yaml` and its groups may hold, and nothing else.
+
+Hydra composes the YAML files and the overrides of the command line; the result is converted to the classes
+below, whose fields have the names of the YAML keys. A key that is not a field, a value of another type or
+outside its bounds gives one line that says where.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+import msgspec
+from hydra import compose, initialize_config_module
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import HydraException
+from msgspec import Meta, Struct
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from marl_sched.domain import get_domain
+from marl_sched.errors import InvalidOptionError
+
+Count = Annotated[int, Meta(ge=1)]
+Natural = Annotated[int, Meta(ge=0)]
+Positive = Annotated[float, Meta(gt=0)]
+NonNegative = Annotated[float, Meta(ge=0)]
+Share = Annotated[float, Meta(ge=0, le=1)]
+
+
+class _Config(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A group of settings; unknown keys are errors."""
+
+
+class EnvConfig(_Config, frozen=True, kw_only=True):
+    """The domain, the scales from which instances are drawn in turn, the reward, and simulator options."""
+
+    name: str
+    scales: Annotated[list[str], Meta(min_length=1)]
+    objective: str
+    options: dict[str, Any]
+
+
+class PolicyConfig(_Config, frozen=True, kw_only=True):
+    """Sizes of a HetGAT network: features per head, heads per layer, layers."""
+
+    width: Count
+    heads: Count
+    layers: Count
+
+
+class PpoConfig(_Config, frozen=True, kw_only=True):
+    """Clipped surrogate optimisation (equation 6.8); learning rate and entropy bonus change linearly."""
+
+    clip: Positive
+    epochs: Count
+    minibatch: Count
+    learning_rate: Positive
+    final_learning_rate: NonNegative
+    entropy: NonNegative
+    final_entropy: NonNegative
+    max_gradient: Positive
+    keep_least: Annotated[float, Meta(gt=0, le=1)]
+
+
+class GaeConfig(_Config, frozen=True, kw_only=True, tag_field="name", tag="gae"):
+    """Advantages from a critic on the full graph; rows play on from update to update, `turns` turns each."""
+
+    instances: Count
+    turns: Count
+    discount: Share
+    trace: Share
+    centred: bool
+    critic: PolicyConfig
+    ppo: PpoConfig
+
+
+class StepBaselineConfig(_Config, frozen=True, kw_only=True, tag_field="name", tag="step_baseline"):
+    """Advantages from `episodes` episodes of the same instance (algorithm 5); whole episodes every update."""
+
+    instances: Count
+    episodes: Annotated[int, Meta(ge=2)]
+    discount: Share
+    ppo: PpoConfig
+
+
+class CurriculumConfig(_Config, frozen=True, kw_only=True):
+    """Episode length in simulated time: see marl_sched.train.curriculum."""
+
+    start: Count
+    step: NonNegative
+    stop: Count
+    spread: Natural
+
+
+class ValidationConfig(_Config, frozen=True, kw_only=True):
+    """Greedy evaluation every so many updates on fixed instances of the first scale, `length` None: whole episodes."""
+
+    every: Count
+    instances: Count
+    episodes: Count
+    seed: Natural
+    length: Count | None
+
+
+class TrainConfig(_Config, frozen=True, kw_only=True):
+    """A whole run; `configs/train.yaml`."""
+
+    env: EnvConfig
+    view: dict[str, Any]
+    policy: PolicyConfig
+    algorithm: GaeConfig | StepBaselineConfig
+    curriculum: CurriculumConfig
+    validation: ValidationConfig
+    seed: Natural
+    updates: Count
+    threads: Count
+    run_dir: str | None
+    save_every: Count
+
+    def directory(self) -> str:
+        """Where the run is written."""
+        view = self.view["kind"]
+        return self.run_dir or f"runs/{self.env.name}-{view}-{self.env.objective}-seed{self.seed}"
+
+    def make_view(self) -> Any:
+        """The domain's view object that `view` describes."""
+        return _view(self)
+
+
+def load_config(overrides: Sequence[str]) -> TrainConfig:
+    """The configuration that Hydra overrides such as `view=local view.reach=2` make of `configs/train.yaml`.
+
+    Raises InvalidOptionError for an override that Hydra cannot apply, an unknown key or a bad value, and
+    UnknownNameError for a domain, scale, objective or view that is not registered.
+    """
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_module("marl_sched.configs", version_base="1.3"):
+            composed = OmegaConf.to_container(compose("train", list(overrides)), resolve=True)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise InvalidOptionError(f"train: {_one_line(error)}") from error
+    return config_from(composed)
+
+
+def config_from(data: Any) -> TrainConfig:
+    """The configuration in plain data, as `load_config` composes it and `msgspec.to_builtins` gives it back."""
+    try:
+        config = msgspec.convert(data, TrainConfig)
+    except msgspec.ValidationError as error:
+        raise InvalidOptionError(f"train: {error}") from error
+    domain = get_domain(config.env.name)
+    for scale in config.env.scales:
+        domain.require_scale(scale)
+    domain.require_objective(config.env.objective)
+    _view(config)
+    return config
+
+
+def _view(config: TrainConfig) -> Any:
+    options = dict(config.view)
+    views = get_domain(config.env.name).views
+    kind = options.pop("kind", None)
+    if kind not in views:
+        raise InvalidOptionError(f"train: view.kind: expected one of {', '.join(sorted(views))}, got {kind!r}")
+    fields = msgspec.inspect.type_info(views[kind]).fields  # type: ignore[attr-defined]  # dataclasses have them
+    known = {field.name for field in fields}
+    for name in options:
+        if name not in known:
+            raise InvalidOptionError(f"train: view.{name}: the view {kind!r} has no such option")
+    try:
+        return msgspec.convert(options, views[kind])
+    except msgspec.ValidationError as error:
+        raise InvalidOptionError(f"train: view: {error}") from error
+
+
+def _one_line(error: Exception) -> str:
+    """Hydra's message without its advice to add keys, which would only be refused later, and its search path."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    told = [line for line in lines if not line.startswith(("To append", "Config search path", "provider=", "See "))]
+    return " ".join(told)

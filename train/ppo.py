@@ -1,0 +1,160 @@
+"""Proximal policy optimisation (dissertation, equation 6.8) over turns of which only the valid ones count."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from marl_sched.agents.hetgat.network import HetGATCritic, HetGATNetwork
+from marl_sched.agents.hetgat.policy import inverse_distribution
+from marl_sched.graph import GraphSpec
+from marl_sched.train.advantages import normalised
+from marl_sched.train.collect import Rollout
+from marl_sched.train.compaction import compacted
+from marl_sched.train.config import PpoConfig
+from marl_sched.train.estimators import Estimate
+
+VALUE_WEIGHT = 0.5
+
+
+@dataclass(frozen=True)
+class UpdateReport:
+    """Means over the minibatches of an update: entropy in nats, approximate KL divergence of new from old policy."""
+
+    policy_loss: float
+    value_loss: float
+    entropy: float
+    kl: float
+    clipped: float
+    gradient: float
+
+
+class Sampler:
+    """Samples a policy by inverse distribution, as an `Act` for collectors; see marl_sched.train.collect."""
+
+    def __init__(self, network: HetGATNetwork) -> None:
+        self._network = network
+        with torch.inference_mode():
+            self._weights = network.weights()
+
+    @torch.inference_mode()
+    def __call__(self, observation: dict[str, Tensor], uniform: np.ndarray) -> tuple[Tensor, Tensor]:
+        """Targets int64 (B,) and log-probabilities float32 (B,)."""
+        visible, names = compacted(self._network.spec, observation)
+        log_probs = self._network(visible, self._weights).log_softmax(-1)
+        picked = torch.from_numpy(inverse_distribution(log_probs.numpy(), uniform))[:, None]
+        return names.gather(1, picked).squeeze(1), log_probs.gather(1, picked).squeeze(1)
+
+
+def samples_of(
+    spec: GraphSpec, rollout: Rollout, estimate: Estimate, keep_least: float, rng: np.random.Generator
+) -> TensorDict:
+    """Valid turns of a rollout as a flat TensorDict of compacted graphs, with normalised advantages and weights.
+
+    Turns that are not valid are left behind here, whatever they hold. Of the others a turn is kept with
+    probability q = max(1 - p, keep_least), p being the probability of what was chosen, and weighs 1 / q:
+    where a policy is nearly certain (a crew that waits, hour after hour) there is little to learn, and
+    the weights keep every sum's expectation. `keep_least` 1 keeps all.
+    """
+    valid = rollout.valid[:-1]
+    certainty = torch.where(valid, rollout.log_probs, 0.0).exp()
+    keep = (1 - certainty).clamp(keep_least, 1.0)
+    kept = (valid & (torch.from_numpy(rng.random(valid.shape)) < keep)).flatten().nonzero().squeeze(1)
+
+    def pick(values: Tensor) -> Tensor:
+        return values[: valid.shape[0]].flatten(0, 1)[kept]
+
+    observation, names = compacted(spec, {name: pick(values) for name, values in rollout.observation.items()})
+    data: dict[str, object] = {
+        "observation": observation,
+        "target": (names == pick(rollout.targets)[:, None]).int().argmax(1),
+        "log_prob": pick(rollout.log_probs),
+        "advantage": pick(normalised(estimate.advantages, valid)).float(),
+        "weight": pick(1 / keep),
+    }
+    if estimate.value_targets is not None:
+        data["value_target"] = pick(estimate.value_targets).float()
+        if rollout.central is not rollout.observation:
+            data["central"], _ = compacted(spec, {name: pick(values) for name, values in rollout.central.items()})
+    return TensorDict(data, batch_size=[len(kept)])
+
+
+def policy_loss(
+    logits: Tensor, targets: Tensor, old_log_probs: Tensor, advantages: Tensor, clip: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Per sample: minus the clipped surrogate of equation 6.8, the probability ratio, and the entropy, (N,) each.
+
+    logits float (N, n_targets), the lowest finite number where a target is not legal; the others (N,).
+    """
+    log_probs = logits.log_softmax(-1)
+    ratio = (log_probs.gather(1, targets[:, None]).squeeze(1) - old_log_probs).exp()
+    surrogate = torch.minimum(ratio * advantages, ratio.clamp(1 - clip, 1 + clip) * advantages)
+    return -surrogate, ratio, -(log_probs.exp() * log_probs).sum(-1)
+
+
+class Ppo:
+    """The optimiser of a policy and, if there is one, its critic, with separate clipping of their gradients.
+
+    Args:
+        policy: observation -> logits (N, n_targets).
+        critic: central observation -> values (N,), or None.
+        config: see PpoConfig.
+    """
+
+    def __init__(self, policy: HetGATNetwork, critic: HetGATCritic | None, config: PpoConfig) -> None:
+        self.policy, self.critic, self.config = policy, critic, config
+        self.modules: dict[str, nn.Module] = {"policy": policy} | ({"critic": critic} if critic is not None else {})
+        self.optimizer = torch.optim.Adam(
+            [parameter for module in self.modules.values() for parameter in module.parameters()], fused=True
+        )
+
+    def update(self, samples: TensorDict, progress: float, rng: np.random.Generator) -> UpdateReport:
+        """Several epochs of minibatches; `progress` in [0, 1] places learning rate and entropy bonus."""
+        config = self.config
+        entropy_weight = _between(config.entropy, config.final_entropy, progress)
+        for group in self.optimizer.param_groups:
+            group["lr"] = _between(config.learning_rate, config.final_learning_rate, progress)
+        reports = []
+        for indices in _minibatches(samples.shape[0], config.minibatch, config.epochs, rng):
+            reports.append(self._step(samples[indices], entropy_weight))
+        return UpdateReport(*np.mean(reports, axis=0).tolist())
+
+    def _step(self, batch: TensorDict, entropy_weight: float) -> tuple[float, ...]:
+        logits, share = self.policy(batch["observation"]), batch["weight"] / batch["weight"].sum()
+        losses, ratio, entropies = policy_loss(
+            logits, batch["target"], batch["log_prob"], batch["advantage"], self.config.clip
+        )
+        loss, entropy = share @ losses, share @ entropies
+        total = loss - entropy_weight * entropy
+        value_loss = torch.zeros(())
+        if self.critic is not None:
+            values = self.critic(batch.get("central", batch["observation"]))
+            value_loss = share @ (values - batch["value_target"]).square()
+            total = total + VALUE_WEIGHT * value_loss
+        self.optimizer.zero_grad()
+        total.backward()
+        norms = [
+            nn.utils.clip_grad_norm_(module.parameters(), self.config.max_gradient) for module in self.modules.values()
+        ]
+        self.optimizer.step()
+        with torch.no_grad():
+            kl = share @ ((ratio - 1) - ratio.log())
+            clipped = share @ ((ratio - 1).abs() > self.config.clip).float()
+        return tuple(value.item() for value in (loss, value_loss, entropy, kl, clipped, norms[0]))
+
+
+def _between(start: float, end: float, progress: float) -> float:
+    return start + (end - start) * progress
+
+
+def _minibatches(count: int, size: int, epochs: int, rng: np.random.Generator) -> Iterator[Tensor]:
+    """Index tensors of at most about `size` samples each; every epoch visits every sample once."""
+    parts = max(1, round(count / size))
+    for _ in range(epochs):
+        order = torch.from_numpy(rng.permutation(count))
+        yield from order.tensor_split(parts)

@@ -1,0 +1,77 @@
+"""A training run from its configuration to a policy: collect, estimate advantages, update, evaluate, log, save."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import torch
+
+from marl_sched.errors import InvalidFileError, InvalidOptionError
+from marl_sched.files import read_json, write_json
+from marl_sched.train.config import TrainConfig, config_from, load_config
+from marl_sched.train.logging import RunLog
+from marl_sched.train.parts import Counters, build
+from marl_sched.train.ppo import Sampler, samples_of
+
+CONFIG = "config.json"
+_SAMPLES = 2  # second word of the seeds that pick and order samples
+
+
+def train_from_overrides(overrides: Sequence[str], *, quiet: bool = False) -> Path:
+    """Run `marl-sched train` with Hydra overrides such as `view=local`; the directory that holds the run.
+
+    Raises InvalidOptionError for a bad override or a directory that holds a run already.
+    """
+    config = load_config(overrides)
+    directory = Path(config.directory())
+    if (directory / CONFIG).exists():
+        raise InvalidOptionError(f"run_dir: {directory} holds a run already; resume it or choose another")
+    write_json(directory / CONFIG, {"overrides": list(overrides), "config": msgspec.to_builtins(config)})
+    return train(config, directory, list(overrides), quiet=quiet)
+
+
+def resume(run_dir: str | Path, *, quiet: bool = False) -> Path:
+    """Go on with a run from its last checkpoint, exactly as if it had not stopped."""
+    directory = Path(run_dir)
+    saved = read_json(directory / CONFIG)
+    if not isinstance(saved, dict) or "config" not in saved:
+        raise InvalidFileError(directory / CONFIG, "config", "a training configuration")
+    return train(config_from(saved["config"]), directory, saved.get("overrides", []), resumed=True, quiet=quiet)
+
+
+def train(
+    config: TrainConfig, directory: Path, overrides: Sequence[str], *, resumed: bool = False, quiet: bool = False
+) -> Path:
+    """The loop. Everything random in an update is a function of (seed, update, instance number)."""
+    torch.set_num_threads(config.threads)
+    parts = build(config)
+    counters = parts.restore(directory) if resumed else Counters()
+    with RunLog(directory, updates=config.updates, start=counters.update, quiet=quiet) as log:
+        while counters.update < config.updates:
+            started = time.perf_counter()
+            update = counters.update
+            rollout = parts.collector.collect(Sampler(parts.ppo.policy), parts.length(update))
+            estimate = parts.estimator.estimate(rollout)
+            rng = np.random.default_rng([config.seed, _SAMPLES, update])
+            samples = samples_of(parts.graph, rollout, estimate, config.algorithm.ppo.keep_least, rng)
+            report = parts.ppo.update(samples, update / config.updates, rng)
+            counters.add(rollout)
+            scores = parts.validate(counters, directory, overrides)
+            counters.seconds += time.perf_counter() - started
+            log.update(
+                {
+                    "reward_rate": rollout.reward_rate,
+                    "explained_variance": estimate.explained_variance,
+                    "length": rollout.length,
+                    **asdict(report),
+                    **{name: value for name, value in asdict(counters).items() if name != "best"},
+                    **scores,
+                }
+            )
+            parts.save(counters, directory)
+    return directory

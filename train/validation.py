@@ -1,0 +1,32 @@
+"""Which of a run's policies is best: greedy play on fixed instances with the same noise every time."""
+
+from __future__ import annotations
+
+from marl_sched.agents.hetgat.network import HetGATNetwork
+from marl_sched.agents.hetgat.policy import HetGATPolicy
+from marl_sched.domain import Domain, get_domain
+from marl_sched.train.config import TrainConfig
+from marl_sched.train.evaluate import Settings, evaluate_scheduler
+
+
+class Validation:
+    """The mean of the run's objective that a network reaches, played greedily on the validation instances."""
+
+    def __init__(self, config: TrainConfig) -> None:
+        self._domain: Domain = get_domain(config.env.name)
+        scale = config.env.scales[0]
+        self._instances = self._domain.instances(scale, config.validation.instances, config.validation.seed)
+        self._settings = Settings(
+            episodes=config.validation.episodes,
+            seed=config.validation.seed,
+            view=config.make_view(),
+            objective=config.env.objective,
+            horizon=config.validation.length,
+            scale=scale,
+            options=config.env.options,
+        )
+
+    def __call__(self, network: HetGATNetwork) -> float:
+        """M1, the mean over instances and episodes."""
+        scores = evaluate_scheduler(self._domain, HetGATPolicy(network), self._instances, self._settings)
+        return float(scores.measures[str(self._settings.objective)].mean())
