@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from marl_sched.agents.base import ObservationScheduler
+from marl_sched.agents.registry import create_scheduler
 from marl_sched.comms import messages as wire
 from marl_sched.comms.options import AgentOptions
 from marl_sched.comms.process import run_process
@@ -28,7 +29,7 @@ REFUSED = 5.0  # seconds for which a refusal is not final: the seat's last proce
 
 
 class Agent:
-    """One agent of a run; `channels` is all that it hears besides the clock and its own turns.
+    """One agent of a run; `subscriptions` is all that it hears: the clock, its turns, and its view's channels.
 
     Raises DeploymentError when there is no world or it does not want this agent, InvalidOptionError when the
     agent does not exist or its policy needs more than an observation.
@@ -38,39 +39,41 @@ class Agent:
         self.options, self.transport = options, transport
         self.agent = options.agent
         self.counts: Counter[str] = Counter()
+        self.subscriptions: set[str] = set()
         self._versions: dict[str, int] = {}
         self._turn: wire.Turn | None = None  # the one to answer, once the belief is up to date
         self._sent: wire.Decision | None = None
         self._incarnation = ""
         self._lost_at: float | None = None
         self._greeted_at = 0.0
-        frame = self._ask_frame()
-        self.domain: Domain = get_domain(frame.env)
-        if self.agent >= frame.agents:
-            raise InvalidOptionError(
-                f"{self.domain.agent_name(self.agent)} does not exist: run {options.run!r} has "
-                f"{self.domain.agent_name(0)} to {self.domain.agent_name(frame.agents - 1)}"
-            )
-        if self.domain.telemetry is None:
-            raise DeploymentError(f"{frame.env} has no telemetry here: another version of this package?")
-        self.belief: Belief = self.domain.telemetry.belief(frame.problem, self.agent)
+        self._meet(self._ask_frame())
         self.scheduler = _load(options.policy, self.domain)
-        self._keys = wire.AgentKeys(self.domain.agent_prefix)
-
-    @property
-    def channels(self) -> tuple[str, ...]:
-        """The telemetry that the agent's view allows."""
-        return self.belief.channels
 
     def run(self) -> Counter[str]:
         """Decide until the run is over; counts of what was heard, decided and dropped."""
-        for key in (wire.CLOCK, self._keys.turn(self.agent), *self.channels):
-            self.transport.subscribe(key)
         self.transport.watch(wire.WORLD_ALIVE)
         over = self._join()
         while not over:
             over = self._handle(self.transport.receive(RETRY))
         return self.counts
+
+    def _meet(self, frame: wire.Frame) -> None:
+        """Know nothing but the frame, and listen to all that may be heard."""
+        self.domain = get_domain(frame.env)
+        self._keys = wire.AgentKeys(self.domain.agent_prefix)
+        if self.agent >= frame.agents:
+            raise InvalidOptionError(
+                f"{self.domain.agent_name(self.agent)} does not exist: run {self.options.run!r} has "
+                f"{self.domain.agent_name(0)} to {self.domain.agent_name(frame.agents - 1)}"
+            )
+        if self.domain.telemetry is None:
+            raise DeploymentError(f"{frame.env} has no telemetry here: another version of this package?")
+        self.belief: Belief = self.domain.telemetry.belief(frame.problem, self.agent)
+        self._versions, self._turn, self._sent = {}, None, None
+        for key in (wire.CLOCK, self._keys.turn(self.agent), *self.belief.channels):
+            if key not in self.subscriptions:
+                self.transport.subscribe(key)
+                self.subscriptions.add(key)
 
     def _ask_frame(self) -> wire.Frame:
         end = time.monotonic() + self.options.join_timeout
@@ -84,18 +87,16 @@ class Agent:
         )
 
     def _join(self) -> bool:
-        """Come in as a new incarnation: catch up, warm up, announce, and say hello until welcomed; True if it is over.
+        """Come in: catch up, warm up, announce, and say hello until welcomed; True if the run is over.
 
         The first decision of a policy is slow, so one is made before the world counts on this agent.
         """
         if self._catch_up():
             return True
         self.scheduler.choose(self.belief.observe(), np.array([0.5]))
-        if self._incarnation:
-            self.transport.withdraw(self._keys.alive(self.agent, self._incarnation))
         self._incarnation = f"{time.time_ns():x}-{os.getpid():x}"
-        self._turn = self._sent = None
         self.transport.announce(self._keys.alive(self.agent, self._incarnation))
+        self._lost_at = None
         end = time.monotonic() + self.options.join_timeout
         refusal = ""
         while time.monotonic() < end:
@@ -117,6 +118,14 @@ class Agent:
             f"{self.domain.agent_name(self.agent)} could not join: {refusal or 'no answer from the world'}"
         )
 
+    def _rejoin(self) -> bool:
+        """Come in again as a new incarnation that knows nothing; True if the run is over."""
+        self.transport.withdraw(self._keys.alive(self.agent, self._incarnation))
+        while self.transport.receive(0.0) is not None:
+            self.counts["skipped"] += 1  # it was said to the last incarnation, the snapshot has what still holds
+        self._meet(self._ask_frame())
+        return self._join()
+
     def _greet(self) -> None:
         hello = wire.Hello(agent=self.agent, incarnation=self._incarnation, policy=self.options.policy)
         self.transport.put(self._keys.hello(self.agent), wire.encode(hello), reliable=True)
@@ -129,11 +138,16 @@ class Agent:
             self._greet()
         if event is None:
             return False
+        if event.kind == "gone":
+            self._lost_at = time.monotonic()
+            return False
+        if event.kind == "alive":  # back again, perhaps as another run
+            return self._lost_at is not None and self._rejoin()
         said = self._hear(event)
         if isinstance(said, wire.Clock):
             return said.phase == "over"
         if isinstance(said, wire.Fenced):
-            return self._join()
+            return self._rejoin()
         if isinstance(said, wire.Turn):
             again = self._turn == said
             self._turn = said
@@ -144,10 +158,7 @@ class Agent:
 
     def _hear(self, event: Event) -> wire.Message | None:
         """The message to this agent that an event brought, None if it brought none or only telemetry."""
-        if event.kind == "stop":
-            raise KeyboardInterrupt
-        if event.kind in ("alive", "gone"):
-            self._lost_at = None if event.kind == "alive" else time.monotonic()
+        if event.kind != "message":
             return None
         self.counts["heard"] += 1
         try:
@@ -207,9 +218,7 @@ class Agent:
 
 
 def _load(policy: str, domain: Domain) -> ObservationScheduler:
-    from marl_sched.agents.airme_rules import RULES
-
-    scheduler = RULES[policy]()
+    scheduler = create_scheduler(policy, domain)
     if not isinstance(scheduler, ObservationScheduler):
         raise InvalidOptionError(f"{policy} needs more than an agent's own observation and cannot be deployed")
     return scheduler

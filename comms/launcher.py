@@ -23,14 +23,16 @@ from typing import Any
 
 import numpy as np
 
+from marl_sched.agents.registry import create_scheduler, scheduler_names
 from marl_sched.comms.options import AgentOptions, DeployOptions
 from marl_sched.comms.session import settle_port
+from marl_sched.domain import Domain
 from marl_sched.errors import DeploymentError
 from marl_sched.files import read_json, write_json
 
 WORLD = "world"
 POLL = 0.05  # seconds between two looks at the children
-GRACE = 3.0  # seconds that a child has to end by itself before it is killed
+GRACE = 2.0  # seconds that a child has to end by itself, and again when asked to, before it is killed
 Progress = Callable[[str, int, int], None]  # (phase, simulated time, horizon)
 
 
@@ -60,18 +62,19 @@ class Deployment:
         self.options = options
         simulator = options.world.simulator()
         self.policies = options.policies(int(simulator.n_agents[0]))
+        for policy in sorted(set(self.policies)):
+            _check_policy(policy, options.world.domain())
         warm_up(options)
         self.endpoint = settle_port(options.world.listen)
         self.children: dict[str, Child] = {}
         self.phase, self.moment, self.horizon = "starting", 0, int(options.world.hours)
-        self._folder = tempfile.TemporaryDirectory(prefix="marl_sched-")
-        self._report = Path(self._folder.name) / "report.json"
 
     def __enter__(self) -> Deployment:
         """Start all processes."""
-        options = self.options
+        self._folder = tempfile.TemporaryDirectory(prefix="marl_sched-")
+        self._report = Path(self._folder.name) / "report.json"
         try:
-            world = replace(options.world, listen=self.endpoint, report=str(self._report))
+            world = replace(self.options.world, listen=self.endpoint, report=str(self._report))
             reader = self._start(WORLD, "marl_sched.comms.world", asdict(world))
             threading.Thread(target=self._follow, args=(reader,), daemon=True).start()
             for agent in range(len(self.policies)):
@@ -181,6 +184,12 @@ def deploy(options: DeployOptions, progress: Progress | None = None) -> dict[str
     if options.world.report:
         write_json(options.world.report, report)
     return report
+
+
+def _check_policy(policy: str, domain: Domain) -> None:
+    """Raise what an agent would say of a policy that does not exist, without loading one that does."""
+    if policy not in scheduler_names(domain.name) and not Path(policy).exists():
+        create_scheduler(policy, domain)
 
 
 def warm_up(options: DeployOptions) -> None:

@@ -116,6 +116,11 @@ class Decision(Message, tag="decision.1"):
     sequence: Natural
     target: Natural
 
+    def answers(self, turn: Turn) -> bool:
+        """Whether this is the answer to that turn, and to no other."""
+        mine = (self.tick, self.agent, self.incarnation, self.sequence)
+        return mine == (turn.tick, turn.agent, turn.incarnation, turn.sequence)
+
 
 M = TypeVar("M", bound=Message)
 _encoder = msgspec.msgpack.Encoder()

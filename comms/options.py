@@ -7,8 +7,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from marl_sched.comms.messages import run_prefix
 from marl_sched.domain import Domain, get_domain
 from marl_sched.errors import InvalidOptionError, require
@@ -25,8 +23,8 @@ class WorldOptions:
 
     Attributes:
         env: a domain's name.
-        scale: of the generated instance and of the padding; with `instance` the padding alone, or "".
-        instance: an instance file; "" generates the scale's first instance of `seed`.
+        scale: of the generated instance and of the padding.
+        instance: an instance file, of no scale; "" generates the scale's first instance of `seed`.
         seed: of the instance's generator and of the noise.
         hours: simulated time of the run; 0: the domain's horizon.
         objective: what the run is rewarded for; "": the domain's first.
@@ -80,17 +78,18 @@ class WorldOptions:
             view = view_type(**self.view_options)
         except TypeError as error:
             raise InvalidOptionError(f"view {self.view}: {error}") from error
+        domain.require_scale(self.scale)
         if self.instance:
             instance = domain.load(Path(self.instance))
         else:
-            instance = domain.generate(domain.require_scale(self.scale), np.random.default_rng([self.seed, 0]))
+            instance = domain.instances(self.scale, 1, self.seed)[0]
         return domain.simulator(
             [instance],
             view=view,
             objective=domain.require_objective(self.objective or domain.objectives[0]),
             horizon=self.hours or domain.default_horizon,
             seed=self.seed,
-            pad=domain.require_scale(self.scale) if self.scale else None,
+            pad=None if self.instance else self.scale,
         )
 
 

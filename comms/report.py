@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,6 +20,12 @@ SCHEMA = 1
 # How a turn went: answered in time, answered with what is impossible in truth or in the agent's view, not answered
 # in time, nobody there to ask. In all but the first the agent idles for this moment.
 DECIDED, CONFLICT, ILLEGAL, LATE, ABSENT = "decided", "conflict", "illegal", "late", "absent"
+
+# Why an agent counts as dead: its liveliness token went (the process ended, froze or was cut off), or it missed too
+# many deadlines in a row.
+GONE, SILENT = "gone", "silent"
+# `stale` are decisions that answer no open turn: late, repeated, or of an incarnation that the world gave up.
+COUNTS = ("conflicts", "illegal", "missed_deadlines", "stale", "unparsed")
 
 
 @dataclass
@@ -70,9 +76,6 @@ class Books:
         return out
 
 
-DEATHS = ("gone", "silent")
-
-
 def build(
     options: WorldOptions, domain: Domain, simulator: TurnSimulator, roster: Roster, books: Books, seconds: float
 ) -> dict[str, Any]:
@@ -86,7 +89,7 @@ def build(
     return {
         "schema": SCHEMA,
         "env": domain.name,
-        "scale": options.scale,
+        "scale": None if options.instance else options.scale,
         "instance": options.instance or None,
         "seed": options.seed,
         "hours": int(simulator.time[0]),
@@ -103,9 +106,11 @@ def build(
         "rewards": books.rewards,
         "messages": books.messages(),
         "latency_ms": books.latency_ms(),
-        **{name: books.counts[name] for name in ("conflicts", "illegal", "missed_deadlines", "stale", "unparsed")},
-        "deaths": [event for event in books.events if event["event"] in DEATHS],
+        **{name: books.counts[name] for name in COUNTS},
+        "deaths": [event for event in books.events if event["event"] in (GONE, SILENT)],
         "events": books.events,
-        "deployment": {k: v for k, v in asdict(options).items() if k in ("run", "deadline", "patience")},
+        "run": options.run,
+        "deadline_s": options.deadline,
+        "delay_bound_s": options.deadline * options.patience,  # by which a dead agent may delay the others in all
         "seconds": round(seconds, 3),
     }

@@ -13,6 +13,7 @@ class Seat:
         incarnation: the process that the world counts on, "" while there is none.
         policy: what decides for it, as the agent says.
         missed: deadlines missed in a row.
+        waited: seconds that the others waited for it in vain, since its last decision.
         turns: turns given so far, the sequence of the last one.
         fenced: incarnations that the world will not count on again.
     """
@@ -20,6 +21,7 @@ class Seat:
     incarnation: str = ""
     policy: str = ""
     missed: int = 0
+    waited: float = 0.0
     turns: int = 0
     fenced: set[str] = field(default_factory=set)
 
@@ -40,11 +42,14 @@ class Roster:
         if not 0 <= agent < len(self.seats):
             return f"there is no agent {agent}, the run has agents 0 to {len(self.seats) - 1}"
         seat = self.seats[agent]
+        if incarnation == seat.incarnation:
+            return ""
         if incarnation in seat.fenced:
             return "this incarnation has been declared dead"
-        if seat.incarnation not in ("", incarnation):
+        if seat.incarnation:
             return "another process decides for this agent"
-        seat.incarnation, seat.policy, seat.missed = incarnation, policy, 0
+        seat.missed, seat.waited = 0, 0.0
+        seat.incarnation, seat.policy = incarnation, policy
         return ""
 
     def bury(self, agent: int, incarnation: str) -> bool:
@@ -56,12 +61,13 @@ class Roster:
         seat.incarnation = ""
         return True
 
-    def miss(self, agent: int) -> bool:
-        """Note a missed deadline; True if it was one too many."""
+    def miss(self, agent: int, waited: float) -> bool:
+        """Note a missed deadline, `waited` seconds after the turn; True if it was one too many."""
         seat = self.seats[agent]
         seat.missed += 1
+        seat.waited += waited
         return seat.missed >= self._patience
 
     def answered(self, agent: int) -> None:
         """Note a decision in time."""
-        self.seats[agent].missed = 0
+        self.seats[agent].missed, self.seats[agent].waited = 0, 0.0

@@ -22,14 +22,14 @@ from marl_sched.errors import DeploymentError, InvalidOptionError
 
 LEASE_MS = 1000
 _ENDPOINT = re.compile(r"tcp/(?P<host>[^\s/:]+|\[[0-9a-fA-F:]+\]):(?P<port>\d{1,5})")
-EventKind = Literal["message", "alive", "gone", "query", "stop"]
+EventKind = Literal["message", "alive", "gone", "query"]
 
 
 class Event(NamedTuple):
-    """Something that happened: a message, a liveliness token that came or went, a query, or the wish to stop."""
+    """Something that happened: a message, a liveliness token that came or went, or a query."""
 
     kind: EventKind
-    key: str = ""  # without the run's prefix
+    key: str  # without the run's prefix
     payload: bytes = b""
     query: Any = None  # to be answered with Link.reply
 
@@ -84,10 +84,6 @@ class Link:
             return self._inbox.get(timeout=max(timeout, 0.0))
         except queue.Empty:
             return None
-
-    def stop(self) -> None:
-        """Put a wish to stop into the inbox; may be called from any thread."""
-        self._inbox.put(Event("stop"))
 
     def subscribe(self, key: str) -> None:
         """See Transport.subscribe."""

@@ -18,7 +18,7 @@ import numpy as np
 from marl_sched.comms import messages as wire
 from marl_sched.comms.options import WorldOptions
 from marl_sched.comms.process import run_process
-from marl_sched.comms.report import ABSENT, CONFLICT, DECIDED, ILLEGAL, LATE, Books, build
+from marl_sched.comms.report import ABSENT, CONFLICT, DECIDED, GONE, ILLEGAL, LATE, SILENT, Books, build
 from marl_sched.comms.roster import Roster
 from marl_sched.comms.session import Event, Transport, hub, settle_port
 from marl_sched.errors import DeploymentError, InvalidMessageError
@@ -138,7 +138,7 @@ class World:
     def _ask(self, agent: int) -> tuple[int, str]:
         """(target, outcome): the agent's decision, or target 0 if it is late or not there."""
         while (event := self.transport.receive(0.0)) is not None:
-            self._handle(event)
+            self._note_stale(self._handle(event))
         seat = self.roster.seats[agent]
         seat.turns += 1
         if not seat.incarnation:
@@ -156,57 +156,69 @@ class World:
         while seat.incarnation == turn.incarnation:
             now = time.monotonic()
             if now >= deadline:
-                return IDLE, self._note_late(agent, now - start)
+                self._note_late(agent, now - start)
+                return IDLE, LATE
             if now >= resend:
                 self._put(self._keys.turn(agent), turn)
                 resend = now + RESEND
             event = self.transport.receive(min(deadline, resend) - now)
             decision = self._handle(event, now - start) if event is not None else None
-            if decision is None:
-                continue
-            if (decision.tick, decision.agent, decision.incarnation, decision.sequence) == (
-                turn.tick, turn.agent, turn.incarnation, turn.sequence,
-            ):  # fmt: skip
+            if decision is not None and decision.answers(turn):
                 self.roster.answered(agent)
                 return decision.target, DECIDED
-            self.books.counts["stale"] += 1
+            self._note_stale(decision)
         return IDLE, ABSENT
 
-    def _note_late(self, agent: int, waited: float) -> str:
+    def _note_stale(self, decision: wire.Decision | None) -> None:
+        if decision is not None:
+            self.books.counts["stale"] += 1
+
+    def _note_late(self, agent: int, waited: float) -> None:
         self.books.counts["missed_deadlines"] += 1
-        self._event(agent, "late", waited)
-        if self.roster.miss(agent):
-            self.roster.bury(agent, self.roster.seats[agent].incarnation)
-            self._event(agent, "silent", waited)
-        return LATE
+        self._event(agent, LATE, waited)
+        if self.roster.miss(agent, waited):
+            seat = self.roster.seats[agent]
+            self.roster.bury(agent, seat.incarnation)
+            self._event(agent, SILENT, seat.waited)
 
     def _handle(self, event: Event, waited: float = 0.0) -> wire.Decision | None:
-        """Take in an event; a decision is handed back, everything else is dealt with."""
-        if event.kind == "stop":
-            raise KeyboardInterrupt
-        if event.kind == "message":
-            self.books.note_heard(event.key, event.payload)
+        """Take in an event; a decision is handed back, everything else is dealt with.
+
+        `waited` is for how many seconds a turn has been open.
+        """
         try:
             if event.kind == "query":
                 self._answer(event)
-                return None
-            agent, leaf, incarnation = self._keys.parse(event.key)
-            if event.kind == "message":
-                kind = wire.Decision if leaf == "decision" else wire.Hello
-                said = wire.decode(event.payload, kind)
-                if said.agent != agent:
-                    raise InvalidMessageError(f"{event.key}: speaks for agent {said.agent}")
-                if isinstance(said, wire.Decision):
-                    return said
-                self._greet(said)
-            elif event.kind == "gone" and self._seated(agent) and self.roster.bury(agent, incarnation):
-                self._event(agent, "gone", waited)
-            elif event.kind == "alive" and self._seated(agent) and incarnation in self.roster.seats[agent].fenced:
-                self._fence(agent, incarnation, "this incarnation has been declared dead")
+            elif event.kind == "message":
+                return self._hear(event)
+            else:
+                self._note_life(event, waited)
         except InvalidMessageError as error:
             self.books.counts["unparsed"] += 1
             log.warning("dropped a message: %s", error)
         return None
+
+    def _hear(self, event: Event) -> wire.Decision | None:
+        self.books.note_heard(event.key, event.payload)
+        agent, leaf, _ = self._keys.parse(event.key)
+        kind = wire.Decision if leaf == "decision" else wire.Hello
+        said = wire.decode(event.payload, kind)
+        if said.agent != agent:
+            raise InvalidMessageError(f"{event.key}: speaks for agent {said.agent}")
+        if isinstance(said, wire.Decision):
+            return said
+        self._greet(said)
+        return None
+
+    def _note_life(self, event: Event, waited: float) -> None:
+        """A liveliness token came or went."""
+        agent, _, incarnation = self._keys.parse(event.key)
+        if not self._seated(agent):
+            return
+        if event.kind == "gone" and self.roster.bury(agent, incarnation):
+            self._event(agent, GONE, self.roster.seats[agent].waited + waited)
+        elif event.kind == "alive" and incarnation in self.roster.seats[agent].fenced:
+            self._fence(agent, incarnation, "this incarnation has been declared dead")
 
     def _seated(self, agent: int) -> bool:
         return agent < len(self.roster.seats)
@@ -242,15 +254,14 @@ class World:
         """Say that it is over until all agents have left, or for FAREWELL seconds."""
         self.phase = "over"
         self._progress(self.phase, self.tick, self._horizon)
-        end = time.monotonic() + FAREWELL
+        events, end = len(self.books.events), time.monotonic() + FAREWELL
         while len(self.roster.missing()) < len(self.roster.seats) and time.monotonic() < end:
             self._put(wire.CLOCK, wire.Clock(tick=self.tick, phase=self.phase))
             event = self.transport.receive(RESEND)
             while event is not None:
-                if event.kind == "gone":
-                    agent, _, incarnation = self._keys.parse(event.key)
-                    self.roster.bury(agent, incarnation)
+                self._handle(event)
                 event = self.transport.receive(0.0)
+        del self.books.events[events:]  # leaving now is no mishap
 
     def _event(self, agent: int, event: str, waited: float = 0.0) -> None:
         self.books.note_event(self.telemetry.moment, self.tick, self.domain.agent_name(agent), event, waited)

@@ -1,0 +1,296 @@
+"""World and agents on a network in memory that loses, repeats and delays as the test says."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+
+from marl_sched.comms import messages as wire
+from marl_sched.comms.agent import Agent
+from marl_sched.comms.options import AgentOptions, WorldOptions
+from marl_sched.comms.session import Event
+from marl_sched.errors import DeploymentError, InvalidOptionError
+
+LOCAL = {"view": "local", "view_options": {"reach": 1, "comm": 1, "staleness": 12}}
+
+
+def options(**changes) -> WorldOptions:
+    """Seven crews; nobody is ever late unless the test says so."""
+    return WorldOptions(**{"seed": 0, "hours": 60, "deadline": 30.0, "ready_timeout": 30.0, **LOCAL, **changes})
+
+
+def assert_same_run(report, reference) -> None:
+    assert report["decisions"] == reference["decisions"]
+    assert report["rewards"] == reference["rewards"]
+    assert report["M1"] == reference["M1"]
+
+
+@pytest.mark.parametrize("view", [LOCAL, {"view": "full"}, {"view": "local", "view_options": {"reach": 0, "comm": 2}}])
+@pytest.mark.parametrize("policy", ["random", "condition"])
+def test_distributed_run_equals_the_run_in_process(make_run, in_process, view, policy):
+    given = options(**{"view_options": {}, **view})
+    report = make_run(given, [policy] * 7).play()
+    assert_same_run(report, in_process(given, [policy] * 7))
+    assert report["missed_deadlines"] == report["unparsed"] == report["stale"] == 0
+    assert report["deaths"] == []
+
+
+def test_lost_and_repeated_messages_change_nothing(make_run, make_bus, in_process):
+    rng = np.random.default_rng(0)
+    bus = make_bus(lambda key, payload: int(rng.choice([0, 1, 2], p=[0.15, 0.7, 0.15])))
+    given = options(hours=12)
+    run = make_run(given, ["random"] * 7, bus)
+    report = run.play()
+    assert_same_run(report, in_process(given, ["random"] * 7))
+    assert sum(agent.counts["snapshots"] for agent in run.agents) > 7  # somebody had to ask again
+    assert report["stale"] > 0  # and some decision came twice
+
+
+def test_agent_subscribes_to_the_clock_its_turns_and_its_views_channels_alone(make_run):
+    run = make_run(options(hours=2), ["condition"] * 7)
+    run.play()
+    assert sorted(run.nodes[0].subscribed) == [
+        "crew/0/status", "crew/0/told", "crew/0/turn", "crew/1/status", "crew/6/status",
+        "plane/0/now", "plane/1/delayed", "plane/6/delayed", "world/clock",
+    ]  # fmt: skip
+    assert run.nodes[0].watched == {"world/alive"}
+
+
+def test_snapshot_holds_no_more_than_the_view_allows(make_run):
+    run = make_run(options(hours=2), ["condition"] * 7)
+    run.play()
+    answers = run.bus.node()
+    request = wire.encode(wire.SnapshotRequest(agent=0))
+    run.world._handle(Event("query", wire.SNAPSHOT, request, answers.inbox))
+    snapshot = wire.decode(answers.inbox.get(), wire.Snapshot)
+    assert set(snapshot.channels) == run.nodes[0].subscribed - {"crew/0/turn", "world/clock"}
+
+
+def test_neither_turns_nor_frame_tell_the_key_of_the_noise(make_run):
+    run = make_run(options(hours=5), ["condition"] * 7)
+    run.play()
+    key = int(run.world.simulator.episode_keys[0])
+    encoded = {msgspec.msgpack.encode(key), key.to_bytes(8, "little"), key.to_bytes(8, "big")}
+    assert not any(secret in payload for _, payload in run.bus.log for secret in encoded)
+
+
+class Killed(BaseException):
+    """Stands for SIGKILL: the thread ends where it is."""
+
+
+def kill_at(run, agent: int, nth_decision: int, *, token_goes: bool) -> None:
+    """Let an agent die just before its n-th decision leaves it."""
+    count = 0
+
+    def put(key: str, payload: bytes) -> None:
+        nonlocal count
+        count += key.endswith("/decision")
+        if count == nth_decision:
+            if token_goes:
+                for token in [token for token in run.bus.tokens if token.startswith(f"crew/{agent}/")]:
+                    run.bus.alive(token, "gone")
+            raise Killed
+
+    run.nodes[agent].on_put = put
+
+
+def test_killed_agent_idles_from_then_on_and_delays_nobody(make_run, in_process):
+    given = options(deadline=20.0)
+    run = make_run(given, ["condition"] * 7)
+    kill_at(run, 3, 2, token_goes=True)
+    report = run.play()
+    (death,) = report["deaths"]
+    mine = [d for d in report["decisions"] if d["agent"] == "crew_3"]
+    assert [d["outcome"] for d in mine[:2]] == ["decided", "absent"]
+    assert {d["outcome"] for d in mine[1:]} == {"absent"}
+    assert (death["agent"], death["event"], death["hour"]) == ("crew_3", "gone", mine[1]["hour"])
+    assert death["waited_s"] < given.deadline  # the token's going ended the wait, not the deadline
+    assert report["missed_deadlines"] == 0
+    assert report["hours"] == given.hours
+    before = [d for d in report["decisions"] if d["hour"] < death["hour"]]
+    assert before == [d for d in in_process(given, ["condition"] * 7)["decisions"] if d["hour"] < death["hour"]]
+
+
+def test_silent_agent_is_waited_for_no_longer_than_patience_allows(make_run):
+    given = options(deadline=0.2, patience=2)
+    run = make_run(given, ["condition"] * 7)
+    kill_at(run, 3, 2, token_goes=False)
+    report = run.play()
+    mine = [d["outcome"] for d in report["decisions"] if d["agent"] == "crew_3"]
+    assert mine[:4] == ["decided", "late", "late", "absent"]
+    assert report["missed_deadlines"] == 2
+    (death,) = report["deaths"]
+    assert death["event"] == "silent"
+    assert 0.4 <= death["waited_s"] < 2.0
+    assert report["delay_bound_s"] == 0.4
+    assert all(d["outcome"] != "late" for d in report["decisions"] if d["agent"] != "crew_3")
+
+
+def test_successor_of_a_dead_agent_joins_and_decides(make_run):
+    run = make_run(options(hours=400), ["condition"] * 7)
+    kill_at(run, 3, 2, token_goes=True)
+    node = run.nodes[3]
+    died = node.on_put
+
+    def put_and_be_reborn(key: str, payload: bytes) -> None:
+        try:
+            died(key, payload)
+        except Killed:
+            run.nodes[3] = run.bus.node()
+            run.bus.nodes.remove(node)
+            run.agent(3)  # the successor lives in the dying thread
+            raise
+
+    node.on_put = put_and_be_reborn
+    report = run.play()
+    joined = [e["hour"] for e in report["events"] if e["agent"] == "crew_3" and e["event"] == "joined"]
+    (death,) = report["deaths"]
+    assert joined == [0, joined[1]]
+    assert joined[1] >= death["hour"]
+    later = [d["outcome"] for d in report["decisions"] if d["agent"] == "crew_3" and d["hour"] > joined[1]]
+    assert later
+    assert "absent" not in later
+
+
+def test_fenced_agent_comes_back_as_another_incarnation(make_run):
+    run = make_run(options(hours=300), ["condition"] * 7)
+    fenced = []
+
+    def lose_the_token_once(key: str, payload: bytes) -> None:
+        if key.endswith("/decision") and not fenced:  # the network, not the process, fails for a moment
+            fenced.extend(token for token in run.bus.tokens if token.startswith("crew/3/"))
+            run.bus.alive(fenced[0], "gone")
+            run.bus.alive(fenced[0], "alive")
+
+    run.nodes[3].on_put = lose_the_token_once
+    report = run.play()
+    assert [e["event"] for e in report["events"] if e["agent"] == "crew_3"] == ["joined", "gone", "joined"]
+    incarnations = {
+        wire.decode(payload, wire.Hello).incarnation for key, payload in run.bus.log if key == "crew/3/hello"
+    }
+    assert len(incarnations) == 2
+    assert report["stale"] == 1  # the decision of the incarnation that was given up
+
+
+def test_decision_is_applied_once_though_it_comes_thrice(make_run, make_bus, in_process):
+    bus = make_bus(lambda key, payload: 3 if key.endswith("/decision") else 1)
+    given = options(hours=20)
+    report = make_run(given, ["random"] * 7, bus).play()
+    reference = in_process(given, ["random"] * 7)
+    assert_same_run(report, reference)
+    last = 2  # copies of the last decision may come after the run
+    assert 2 * len(reference["decisions"]) - last <= report["stale"] <= 2 * len(reference["decisions"])
+
+
+def noise_on(run, key: str, payload: bytes) -> None:
+    """Put a foreign message in with every hello."""
+    intruder = run.bus.node()
+    before = run.nodes[0].on_put
+
+    def put(own_key: str, own_payload: bytes) -> None:
+        if before is not None:
+            before(own_key, own_payload)
+        if own_key.endswith("/decision"):
+            intruder.put(key, payload)
+
+    run.nodes[0].on_put = put
+
+
+FOREIGN = wire.encode(wire.Decision(tick=0, agent=1, incarnation="forged", sequence=1, target=5))
+
+
+@pytest.mark.parametrize(
+    ("key", "payload", "count"),
+    [
+        ("crew/1/decision", b"\xc1garbage", "unparsed"),
+        ("crew/1/decision", b"", "unparsed"),
+        ("crew/x/decision", FOREIGN, "unparsed"),
+        ("crew/2/decision", FOREIGN, "unparsed"),  # speaks for crew 1
+        ("crew/1/decision", FOREIGN, "stale"),
+        ("crew/99/decision", wire.encode(wire.Decision(tick=0, agent=99, incarnation="", sequence=0, target=0)), "stale"),
+        ("crew/1/hello", FOREIGN, "unparsed"),
+    ],
+)  # fmt: skip
+def test_foreign_messages_are_counted_and_dropped(make_run, in_process, caplog, key, payload, count):
+    given = options(hours=20)
+    run = make_run(given, ["condition"] * 7)
+    noise_on(run, key, payload)
+    report = run.play()
+    assert_same_run(report, in_process(given, ["condition"] * 7))
+    assert report[count] > 0
+    assert ("dropped a message" in caplog.text) == (count == "unparsed")
+
+
+def test_agent_counts_and_drops_what_it_cannot_read(make_run, in_process):
+    given = options(hours=20)
+    run = make_run(given, ["condition"] * 7)
+    noise_on(run, "plane/0/now", b"\xc1garbage")
+    assert_same_run(run.play(), in_process(given, ["condition"] * 7))
+    assert run.agents[0].counts["unparsed"] > 0
+    assert run.errors == []
+
+
+def test_illegal_target_idles_the_agent_for_the_hour(make_run):
+    run = make_run(options(hours=10), ["condition"] * 7)
+
+    class Stubborn:
+        def choose(self, observation, uniform):
+            return np.array([10**6])
+
+    original = run.agent
+
+    def agent(index: int) -> None:
+        if index != 2:
+            original(index)
+            return
+        run.agents[2] = Agent(AgentOptions(agent=2, policy="condition"), run.nodes[2])
+        run.agents[2].scheduler = Stubborn()
+        run.agents[2].run()
+
+    run.agent = agent
+    report = run.play()
+    mine = [d for d in report["decisions"] if d["agent"] == "crew_2"]
+    assert [d["outcome"] for d in mine] == ["illegal"] * 10  # never at work, so asked every hour
+    assert report["illegal"] == 10
+
+
+def test_missing_agents_are_named_when_the_time_is_up(make_run):
+    run = make_run(options(ready_timeout=1e-3), [])
+    for agent in range(5):
+        hello = wire.encode(wire.Hello(agent=agent, incarnation="a", policy="condition"))
+        run.world.transport.inbox.put(Event("message", f"crew/{agent}/hello", hello))
+    with pytest.raises(DeploymentError, match=r"not there within 0\.001 s: crew_5, crew_6"):
+        run.play()
+
+
+def test_agent_for_a_crew_that_does_not_exist_says_so(make_run):
+    run = make_run(options(hours=2), ["condition"] * 8)
+    run.play()
+    (error,) = run.errors
+    assert isinstance(error, InvalidOptionError)
+    assert str(error) == "crew_7 does not exist: run 'run' has crew_0 to crew_6"
+
+
+def test_replaced_policy_changes_nobody_else_before_they_meet(make_run):
+    given = options(hours=60, **{"view_options": {"reach": 0, "comm": 0}})
+    plain = make_run(given, ["condition"] * 7).play()["decisions"]
+    other = make_run(given, ["condition"] * 3 + ["random"] + ["condition"] * 3).play()["decisions"]
+    assert [d for d in plain if d["agent"] == "crew_3"] != [d for d in other if d["agent"] == "crew_3"]
+    # With reach and comm of 0 crews never meet: nobody sees, hears or wants another's plane.
+    assert [d for d in plain if d["agent"] != "crew_3"] == [d for d in other if d["agent"] != "crew_3"]
+
+
+def test_report_counts_messages_and_latencies(make_run):
+    run = make_run(options(hours=30), ["condition"] * 7)
+    report = run.play()
+    sent = [key for key, _ in run.bus.log if key.startswith(("plane/", "world/")) or key.endswith(("status", "told"))]
+    telemetry = {
+        k: v for k, v in report["messages"]["sent"].items() if k not in ("crew/turn", wire.FRAME, wire.SNAPSHOT)
+    }
+    assert sum(v["count"] for v in telemetry.values()) == len(sent)
+    assert report["messages"]["heard"]["crew/decision"]["count"] == len(report["decisions"])
+    assert 0 < report["latency_ms"]["p50"] <= report["latency_ms"]["p99"]
+    assert len(report["profit"]) == report["hours"] == 30
+    assert np.mean(report["profit"]) == pytest.approx(report["M1"], abs=1e-12)
+    assert 0 < report["view"]["visible_share"] < 0.5
