@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -29,7 +29,8 @@ class SchedulingEnv(gymnasium.Env):
     Raises InvalidOptionError if a view is given.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["ansi", "rgb_array"], "render_fps": 10}
+    # An instance variable to type checkers, as gymnasium.Env declares it; `make` reads it from the class.
+    metadata: dict[str, Any] = {"render_modes": ["ansi", "rgb_array"], "render_fps": 10}  # noqa: RUF012
 
     def __init__(self, domain: str | Domain, *, render_mode: str | None = None, **options: Any) -> None:
         if "view" in options:

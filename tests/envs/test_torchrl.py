@@ -1,0 +1,266 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from tensordict import TensorDict  # noqa: E402
+from torchrl.envs import TransformedEnv, step_mdp  # noqa: E402
+from torchrl.envs.transforms import ActionMask, StepCounter  # noqa: E402
+from torchrl.envs.utils import check_env_specs  # noqa: E402
+
+from marl_sched.envs.sampling import random_legal  # noqa: E402
+from marl_sched.envs.torchrl_env import SchedulingTorchRL  # noqa: E402
+from marl_sched.errors import IllegalActionError, InvalidOptionError, UnknownNameError  # noqa: E402
+
+HORIZON = 40
+
+
+def make(domain, **options):
+    return SchedulingTorchRL(domain, **{"horizon": HORIZON, "batch_size": 3, **options})
+
+
+def advance(env, td, turns):
+    for _ in range(turns):
+        td = step_mdp(env.step(env.rand_action(td)))
+    return td
+
+
+def identities(env):
+    return [instance.identity for instance in env.simulator.instances]
+
+
+def test_passes_torchrls_check_of_specs(domain, view):
+    check_env_specs(make(domain, view=view))
+
+
+def test_passes_the_check_across_ends_of_episodes(domain):
+    check_env_specs(make(domain, horizon=1), break_when_any_done=False)
+
+
+def test_rollouts_without_a_policy_choose_legal_targets(domain):
+    rollout = make(domain).rollout(60, break_when_any_done=False)
+    legal = rollout["action_mask"].gather(-1, rollout["action"].unsqueeze(-1))
+    assert legal.bool().all()
+    assert rollout["next", "done"].any()
+    assert len(rollout["action"].unique()) > 5
+
+
+def test_random_choices_are_uniform_over_legal_targets():
+    mask = np.array([[1, 0, 1, 1, 0]], np.int8)
+    chosen = [int(random_legal(mask, np.array([u]))[0]) for u in (0.0, 0.33, 0.34, 0.66, 0.67, 0.999999)]
+    assert chosen == [0, 0, 2, 2, 3, 3]
+
+
+def test_the_mask_transform_serves_policies_that_sample_from_the_spec(domain):
+    env = TransformedEnv(make(domain), ActionMask())
+    td = env.reset()
+    for _ in range(30):
+        td["action"] = env.action_spec.rand()
+        td = step_mdp(env.step(td))
+
+
+def test_dtypes_and_shapes_are_those_of_the_page(domain):
+    td = make(domain).rollout(5)["next"][:, -1]
+    assert td["reward"].dtype == torch.float64
+    assert td["reward"].shape == (3, 1)
+    for name in ("done", "terminated", "truncated"):
+        assert td[name].shape == (3, 1)
+    for name, dtype in (("acting", torch.int64), ("elapsed", torch.int64), ("conflict", torch.bool)):
+        assert td[name].shape == (3,)
+        assert td[name].dtype == dtype
+
+
+def test_reward_comes_with_the_time_that_passed(domain):
+    env = make(domain, batch_size=2)
+    td = env.reset()
+    total, time = torch.zeros(2, 1, dtype=torch.float64), torch.zeros(2, dtype=torch.int64)
+    while not td["done"].all():
+        td = step_mdp(env.step(env.rand_action(td)), exclude_reward=False)
+        total += td["reward"]
+        time += td["elapsed"]
+    assert (td["acting"] == -1).all()
+    assert (total != 0).all()
+    np.testing.assert_array_equal(time, env.simulator.time)
+    if domain.name == "airme":
+        np.testing.assert_allclose(total[:, 0] / HORIZON, env.simulator.objectives()["profit"], rtol=0, atol=1e-12)
+
+
+def test_resetting_some_rows_leaves_the_others_untouched(domain, bits):
+    env = make(domain)
+    td = advance(env, env.reset(), 15)
+    before = [bits(env.simulator.snapshot(b)) for b in range(3)]
+    marked = torch.tensor([[False], [True], [False]])
+    after = env.reset(td.clone().set("_reset", marked))
+    for b in (0, 2):
+        assert bits(env.simulator.snapshot(b)) == before[b]
+        for name in env.simulator.arrays:
+            assert torch.equal(after[name][b], td[name][b])
+    assert bits(env.simulator.snapshot(1)) != before[1]
+    assert env.simulator.time.tolist()[1] == 0
+    advance(env, after, 5)
+
+
+def test_rows_that_end_start_again_alone(domain, bits):
+    env = make(domain)
+    td = env.reset()
+    ended = 0
+    for _ in range(400):
+        counts, times = env._count.copy(), env.simulator.time.copy()
+        data, td = env.step_and_maybe_reset(env.rand_action(td))
+        done = data["next", "done"][:, 0].numpy()
+        np.testing.assert_array_equal(env._count, counts + done)
+        assert (env.simulator.time[done] == 0).all()
+        assert (env.simulator.time[~done] >= times[~done]).all()
+        assert (data["next", "acting"][done] == -1).all()
+        assert not td["done"].any()
+        assert (td["acting"] >= 0).all()
+        ended += int(done.sum())
+        if done.any() and not done.all():
+            fresh = env.simulator.observe(env.simulator.acting)
+            for name, array in fresh.items():
+                np.testing.assert_array_equal(td[name].numpy(), array)
+    assert ended >= 3
+
+
+def test_tensors_already_handed_out_do_not_change(domain):
+    env = make(domain, horizon=5)
+    td = env.reset()
+    kept, copies = [], []
+    for _ in range(20):
+        data, td = env.step_and_maybe_reset(env.rand_action(td))
+        kept.append(data)
+        copies.append(data.clone())
+    for data, copy in zip(kept, copies, strict=True):
+        assert (data == copy).all()
+
+
+def test_a_seed_repeats_a_rollout_to_the_last_bit(domain, view):
+    env = make(domain, view=view)
+
+    def trace(seed):
+        env.set_seed(seed)
+        return env.rollout(50, break_when_any_done=False)
+
+    assert (trace(4) == trace(4)).all()
+    first, other = trace(4), trace(5)
+    assert not torch.equal(first["action"], other["action"])
+
+
+def test_every_reset_goes_on_to_the_next_episode(domain):
+    env = make(domain, batch_size=2)
+    keys, rows = set(), None
+    for _ in range(3):
+        env.reset()
+        keys.update(env.simulator.episode_keys.tolist())
+        assert rows in (None, identities(env))
+        rows = identities(env)
+    assert len(keys) == 6
+    env.set_seed(0)
+    env.reset()
+    assert set(env.simulator.episode_keys.tolist()) <= keys
+
+
+def test_rows_that_share_an_instance_never_play_the_same_episode(domain):
+    a, b = domain.instances("small", 2, seed=3)
+    env = make(domain, batch_size=None, instances=[a, b, a, a])
+    keys = []
+    for _ in range(3):
+        env.reset()
+        keys += env.simulator.episode_keys.tolist()
+    assert len(set(keys)) == len(keys)
+    alone = make(domain, batch_size=None, instances=[b])
+    alone.reset()
+    alone.reset()
+    assert alone.simulator.episode_keys[0] == keys[4 + 1]
+
+
+def test_a_source_gives_new_instances_at_every_reset(domain):
+    asked = []
+
+    def source(row, number):
+        asked.append((row, number))
+        return domain.generate("small", np.random.default_rng([9, row, number]))
+
+    env = make(domain, batch_size=2, source=source)
+    del asked[:]
+    env.reset()
+    first = identities(env)
+    td = env.reset()
+    assert asked == [(0, 0), (1, 0), (0, 1), (1, 1)]
+    assert not set(first) & set(identities(env))
+    env.reset(td.set("_reset", torch.tensor([[False], [True]])))
+    assert asked[-1] == (1, 2)
+    assert len(asked) == 5
+
+
+def test_an_illegal_choice_raises_and_changes_nothing(domain, bits):
+    env = make(domain)
+    td = advance(env, env.reset(), 4)
+    before = [bits(env.simulator.snapshot(b)) for b in range(3)]
+    agent = domain.agent_name(int(td["acting"][1]))
+    forbidden = int(np.flatnonzero(td["action_mask"][1].numpy() == 0)[0])
+    for target in (forbidden, -1, env.simulator.max_targets):
+        td["action"] = torch.tensor([0, target, 0])
+        with pytest.raises(IllegalActionError, match=f"row 1: {agent}: target {target} is not legal; legal: 0"):
+            env.step(td)
+    assert [bits(env.simulator.snapshot(b)) for b in range(3)] == before
+
+
+def test_rows_that_are_over_ignore_their_choice(domain):
+    env = make(domain, batch_size=1, horizon=1)
+    td = env.reset()
+    while not td["done"].all():
+        td = step_mdp(env.step(env.rand_action(td)))
+    td["action"] = torch.tensor([env.simulator.max_targets - 1])
+    assert env.step(td)["next", "reward"].item() == 0.0
+
+
+def test_schemes_pass_through_to_the_simulator():
+    env = make("airme", batch_size=1, scheme="single")
+    td = env.reset()
+    td["action"] = torch.tensor([1])
+    td = env.step(td)["next"]
+    assert td["elapsed"].tolist() == [1]
+
+
+def test_a_padded_instance_hides_what_it_lacks(domain, padded):
+    env = make(domain, batch_size=None, instances=[padded])
+    own = domain.simulator([padded], view=env.simulator.view)
+    rollout = env.rollout(20)
+    assert not rollout["action_mask"][..., own.max_targets :].any()
+    assert rollout["acting"].max() < own.max_agents
+
+
+def test_works_under_torchrls_transforms(domain):
+    env = TransformedEnv(make(domain, horizon=5), StepCounter())
+    rollout = env.rollout(40, break_when_any_done=False)
+    assert rollout["next", "done"].any()
+    assert rollout["step_count"].max() < 39
+
+
+def test_actions_are_made_without_a_tensordict(domain):
+    env = make(domain)
+    env.reset()
+    action = env.rand_action()
+    assert isinstance(action, TensorDict)
+    assert env.action_spec.contains(action["action"])
+
+
+def test_wrong_options_raise(domain):
+    with pytest.raises(TypeError, match="heigth"):
+        make(domain, heigth=3)
+    with pytest.raises(UnknownNameError, match="did you mean 'small'"):
+        make(domain, scale="smal")
+    for batch_size in (None, 0):
+        with pytest.raises(InvalidOptionError, match="batch_size"):
+            make(domain, batch_size=batch_size)
+    with pytest.raises(InvalidOptionError, match="instances: expected one per row"):
+        make(domain, batch_size=3, instances=domain.instances("small", 2, seed=0))
+    with pytest.raises(InvalidOptionError, match="source"):
+        make(domain, instances=domain.instances("small", 3, seed=0), source=lambda row, number: None)
+    with pytest.raises(InvalidOptionError, match="scale"):
+        make(domain, scale=None)
+    with pytest.raises(InvalidOptionError, match="seed"):
+        make(domain).set_seed(-3)
