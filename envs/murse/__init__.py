@@ -1,1 +1,1 @@
-"""MuRSE: human-robot teams that schedule tasks under deadlines, waits and separation, round after round."""
+"""MuRSE: teams of robots and of humans who learn, under temporal and spatial constraints (chapters 3 to 5)."""

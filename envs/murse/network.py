@@ -1,0 +1,77 @@
+"""A MuRSE problem as a simple temporal network (dissertation, sections 3.3, 4.3.1 and 5.4.1).
+
+In the full network the points are s0, f0, s_1, f_1, s_2, f_2, ...: origin, end of all, and every task's start
+and finish, as in figure 4.2. In the simplified one they are s0, s_1, ..., s_n, f0: a task is its start.
+Distances are those of marl_sched.temporal_network.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from marl_sched.envs.murse.instance import NO_DEADLINE
+from marl_sched.temporal_network import relax, unconstrained
+
+ORIGIN, END = 0, 1
+
+
+@njit(cache=True, inline="always")
+def start_point(task: int) -> int:
+    """The point of the full network at which a task, counted from 0, starts."""
+    return 2 + 2 * task
+
+
+@njit(cache=True, inline="always")
+def finish_point(task: int) -> int:
+    """The point of the full network at which a task, counted from 0, finishes."""
+    return 3 + 2 * task
+
+
+@njit(cache=True)
+def task_network(
+    shortest: np.ndarray, longest: np.ndarray, lags: np.ndarray, deadlines: np.ndarray, horizon: int
+) -> np.ndarray:
+    """The full network, not yet closed, int64 (2 n + 2, 2 n + 2).
+
+    shortest and longest int64 (n,) bound each task's duration (equation 4.2); lags (n, n) and deadlines (n,) as
+    in MurseInstance; everything lies between s0 and f0, which are at most `horizon` apart.
+    """
+    n = len(shortest)
+    distances = unconstrained(2 * n + 2)
+    relax(distances, ORIGIN, END, horizon)
+    relax(distances, END, ORIGIN, 0)
+    for i in range(n):
+        start, finish = start_point(i), finish_point(i)
+        relax(distances, start, ORIGIN, 0)
+        relax(distances, END, finish, 0)
+        relax(distances, start, finish, longest[i])
+        relax(distances, finish, start, -shortest[i])
+        if deadlines[i] != NO_DEADLINE:
+            relax(distances, ORIGIN, finish, deadlines[i])
+        for j in range(n):
+            if lags[i, j] >= 0:
+                relax(distances, start, finish_point(j), -lags[i, j])
+    return distances
+
+
+@njit(cache=True)
+def simplified_network(durations: np.ndarray, lags: np.ndarray, deadlines: np.ndarray, horizon: int) -> np.ndarray:
+    """The network on starts alone, not yet closed, int64 (n + 2, n + 2), points s0, s_1, ..., s_n, f0.
+
+    Bounds that lead to a finish lead to its start instead, less the duration, int64 (n,) (section 5.4.1).
+    Closed, it is the minimum distance graph of section 4.3.1 without its finishes.
+    """
+    n = len(durations)
+    distances = unconstrained(n + 2)
+    relax(distances, 0, n + 1, horizon)
+    relax(distances, n + 1, 0, 0)
+    for i in range(n):
+        relax(distances, i + 1, 0, 0)
+        relax(distances, n + 1, i + 1, -durations[i])
+        if deadlines[i] != NO_DEADLINE:
+            relax(distances, 0, i + 1, deadlines[i] - durations[i])
+        for j in range(n):
+            if lags[i, j] >= 0:
+                relax(distances, i + 1, j + 1, -lags[i, j] - durations[j])
+    return distances

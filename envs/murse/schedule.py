@@ -1,0 +1,69 @@
+"""A round's schedule as plain data: what `marl_sched.envs.murse.validation` checks and what pictures are drawn from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from marl_sched.envs.murse.instance import NO_DEADLINE
+from marl_sched.envs.murse.state import NOBODY
+from marl_sched.errors import InvalidOptionError
+from marl_sched.files import write_json
+
+if TYPE_CHECKING:
+    from marl_sched.envs.murse.simulator import MurseSimulator
+
+SCHEMA = 1
+
+
+def schedule(simulator: MurseSimulator, row: int = 0, round_index: int | None = None) -> dict[str, Any]:
+    """An ended round of one row, the last one by default, with the constraints that it has to keep.
+
+    `dispatch` lists the tasks, counted from 1, in order of dispatch with agent, true duration and true times; in
+    `online` mode also the time at which the agent committed, before which the task cannot start. Raises
+    InvalidOptionError if the round has not ended.
+    """
+    ended = int(simulator.state.rows["round"][row])
+    chosen = ended - 1 if round_index is None else round_index
+    if not 0 <= chosen < ended:
+        raise InvalidOptionError(f"round {chosen}: {ended} rounds have ended in row {row}")
+    instance, result = simulator.instances[row], simulator.state.rounds[row, chosen]
+    executed = simulator.state.executed[row, chosen, : instance.n_tasks]
+    dispatched = [i for i in np.argsort(executed["position"], kind="stable") if executed["agent"][i] != NOBODY]
+    names = ("agent", "start", "finish", *(("committed",) if simulator.mode == "online" else ()))
+    return {
+        "schema": SCHEMA,
+        "env": "murse",
+        "round": chosen,
+        "mode": simulator.mode,
+        "agents": [f"robot {a}" if a < instance.n_robots else f"human {a}" for a in range(instance.n_agents)],
+        "proximity": instance.proximity,
+        "safety_distance": float(instance.safety_distance),
+        "longest": int(result["longest"]),
+        "tasks": [
+            {
+                "deadline": None if instance.deadlines[i] == NO_DEADLINE else int(instance.deadlines[i]),
+                "waits": [{"after": int(j) + 1, "time": int(w)} for k, j, w in instance.waits if k == i],
+                "location": instance.locations[i].tolist(),
+                "eligible": np.flatnonzero(instance.eligible[i]).tolist(),
+            }
+            for i in range(instance.n_tasks)
+        ],
+        "dispatch": [
+            {
+                "task": int(i) + 1,
+                "duration": int(executed["finish"][i] - executed["start"][i]),
+                **{name: int(executed[name][i]) for name in names},
+            }
+            for i in dispatched
+        ],
+        "feasible": bool(result["feasible"]),
+        "makespan": int(result["makespan"]),
+    }
+
+
+def save_schedule(simulator: MurseSimulator, path: str | Path, row: int = 0, round_index: int | None = None) -> None:
+    """Write `schedule` as JSON, beside and renamed."""
+    write_json(path, schedule(simulator, row, round_index))

@@ -1,0 +1,247 @@
+"""MuRSE as a batched turn-based simulator: the arrays' setting up and the calls into the kernels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from marl_sched.envs.murse import dynamics, graph, rules
+from marl_sched.envs.murse.generate import SCALES
+from marl_sched.envs.murse.instance import DURATIONS, PROXIMITY, MurseInstance
+from marl_sched.envs.murse.state import NOBODY, load_instance, new_state
+from marl_sched.envs.murse.views import FullView, LocalView
+from marl_sched.errors import IllegalActionError, InvalidOptionError, require
+from marl_sched.noise import episode_key
+from marl_sched.simulation import Observation, TurnSimulator
+
+DEFAULT_HORIZON = 10
+DEFAULT_MULTIPLIER = 2.0
+
+
+class MurseSimulator(TurnSimulator):
+    """A batch of MuRSE instances, one per row; see TurnSimulator for the turn-taking and its attributes.
+
+    An episode is an instance's rounds, one after the other; `time` runs on over the rounds.
+
+    Args:
+        instances: one MurseInstance per row.
+        view: what acting agents see.
+        objective: "makespan" or "weighted" (completion time), what the reward charges, per round.
+        horizon: rounds of an episode, if the instance has that many.
+        seed: of the first episode's noise.
+        pad: a scale whose largest instance sets the padding; None pads to the largest of `instances`.
+        mode: "plan" builds a round's schedule on estimates and then executes it; "online" decides in real time.
+        picking: which of several free agents decides first (section 4.2.2): "first", "mean_unscheduled",
+            "min_unscheduled" or "mean_all", on estimated durations, ties by index.
+        rewards: "round" pays minus the objective when a round ends; "decision" pays every change of it
+            (section 3.4.1); both charge an infeasible round at least the longest round. "published" is equation
+            5.2 as it stands, in which failing can pay better than finishing.
+        multiplier: of the worst case in the charge for an infeasible round (C_i of equation 5.2).
+        divisor: of all changes but the last under "decision" (D of section 3.4.1).
+        simplification: "sparse" or "distance" edges between tasks, see marl_sched.envs.murse.graph.
+        durations, proximity: replace the instances' own settings.
+
+    Raises InvalidOptionError or UnknownNameError for options outside their domain.
+    """
+
+    def __init__(
+        self,
+        instances: Sequence[MurseInstance],
+        *,
+        view: FullView | LocalView | None = None,
+        objective: str = "makespan",
+        horizon: int = DEFAULT_HORIZON,
+        seed: int = 0,
+        pad: str | None = None,
+        mode: str = "plan",
+        picking: str = "first",
+        rewards: str = "round",
+        multiplier: float = DEFAULT_MULTIPLIER,
+        divisor: float = 1.0,
+        simplification: str = "sparse",
+        durations: str | None = None,
+        proximity: str | None = None,
+    ) -> None:
+        if not instances:
+            raise InvalidOptionError("instances: expected at least one")
+        if horizon < 1:
+            raise InvalidOptionError(f"horizon: expected at least 1 round, got {horizon}")
+        for name, value in (("multiplier", multiplier), ("divisor", divisor)):
+            if not 1.0 <= value < float("inf"):
+                raise InvalidOptionError(f"{name}: expected a number >= 1, got {value}")
+        require("simplification of murse", simplification, graph.SIMPLIFICATIONS)
+        self._settings: dict[str, Any] = {}
+        for name, setting, known in (("durations", durations, DURATIONS), ("proximity", proximity, PROXIMITY)):
+            if setting is not None:
+                self._settings[name] = require(f"{name} of murse", setting, known)
+        self.rules = rules.Rules(
+            mode=_code("mode", mode, rules.MODES),
+            picking=_code("picking strategy", picking, rules.PICKING),
+            objective=_code("objective of murse", objective, rules.OBJECTIVES),
+            rewards=_code("rewards of murse", rewards, rules.REWARDS),
+            multiplier=float(multiplier),
+            divisor=float(divisor),
+        )
+        self.view = view if view is not None else FullView()
+        self.objective, self.mode, self.horizon = objective, mode, horizon
+        self.instances = [self._with_settings(instance) for instance in instances]
+        self.batch = len(self.instances)
+        self._allocate(pad, graph.SIMPLIFICATIONS.index(simplification))
+        self._loaded: list[MurseInstance | None] = [None] * self.batch
+        self._seeds = np.full(self.batch, seed, np.int64)
+        self._episodes = np.full(self.batch, -1, np.int64)
+        self.reset(seed=seed)
+
+    def _allocate(self, pad: str | None, simplification: int) -> None:
+        """Set the padding, the arrays and the observation's layout."""
+        if pad is not None:
+            scale = SCALES[require("scale of murse", pad, SCALES)]
+            tasks, agents = scale.tasks[1], scale.agents[1]
+        else:
+            tasks, agents = max(i.n_tasks for i in self.instances), max(i.n_agents for i in self.instances)
+        self._max_tasks, self.max_targets, self.max_agents = tasks, tasks + 2, agents
+        self.state = new_state(self.batch, tasks, agents, self.horizon)
+        self.graph = graph.graph_spec(simplification)
+        sizes = {"task": tasks + 2, "agent": agents, "location": tasks, "decision": tasks + 2}
+        self.arrays = self.graph.arrays(sizes)
+        self._no_reverse = (np.zeros((0, 0, 0), np.int8), np.zeros((0, 0, 0, 0), np.float32))
+        rows = self.state.rows
+        self.n_agents, self.acting, self.time = rows["n_agents"], rows["acting"], rows["time"]
+        self.reward, self.elapsed, self.conflict = rows["reward"], rows["elapsed"], rows["conflict"]
+        self.terminated, self.truncated = rows["terminated"], rows["truncated"]
+        self.episode_keys = rows["episode"]
+
+    def _with_settings(self, instance: MurseInstance) -> MurseInstance:
+        return replace(instance, **self._settings) if self._settings else instance
+
+    def reset(
+        self,
+        rows: np.ndarray | None = None,
+        *,
+        seed: int | None = None,
+        instances: Sequence[MurseInstance] | None = None,
+        episodes: Sequence[int] | None = None,
+    ) -> None:
+        """Start new episodes; see TurnSimulator.reset."""
+        chosen = np.arange(self.batch) if rows is None else np.flatnonzero(rows)
+        for name, given in (("instances", instances), ("episodes", episodes)):
+            if given is not None and len(given) != len(chosen):
+                raise InvalidOptionError(f"{name}: expected one per chosen row ({len(chosen)}), got {len(given)}")
+        for b, instance in zip(chosen, instances or [], strict=False):
+            self.instances[b] = self._with_settings(instance)
+        if seed is not None:
+            self._seeds[chosen] = seed
+            self._episodes[chosen] = 0
+        else:
+            self._episodes[chosen] += 1
+        if episodes is not None:
+            self._episodes[chosen] = episodes
+        for b in chosen:
+            self._load(int(b))
+        dynamics.begin_rows(self.state, self.rules, chosen.astype(np.int64))
+
+    def _load(self, b: int) -> None:
+        """Bring a row's instance into the arrays if it is not there yet, and name the episode's noise."""
+        instance = self.instances[b]
+        if self._loaded[b] is not instance:
+            if instance.n_tasks > self._max_tasks or instance.n_agents > self.max_agents:
+                raise InvalidOptionError(
+                    f"instances[{b}]: {instance.n_tasks} tasks and {instance.n_agents} agents exceed the padding of "
+                    f"{self._max_tasks} tasks and {self.max_agents} agents"
+                )
+            load_instance(self.state, b, instance, min(instance.n_rounds, self.horizon))
+            self._loaded[b] = instance
+        key = episode_key(np.uint64(self._seeds[b]), np.uint64(instance.identity), np.uint64(self._episodes[b]))
+        self.state.rows["episode"][b] = np.uint64(key)
+
+    def step(self, targets: np.ndarray) -> None:
+        """Take one turn in every row; see TurnSimulator.step."""
+        targets = np.asarray(targets, np.int64)
+        if targets.shape != (self.batch,):
+            raise IllegalActionError(f"targets: expected shape {(self.batch,)}, got {targets.shape}")
+        if targets.min() < 0 or targets.max() >= self.max_targets:
+            bad = int(targets.min()) if targets.min() < 0 else int(targets.max())
+            raise IllegalActionError(f"target {bad}: expected a task's slot in [0, {self.max_targets - 1}]")
+        dynamics.step(self.state, self.rules, targets)
+
+    def play_round(self, row: int, tasks: np.ndarray, agents: np.ndarray) -> None:
+        """Execute a whole schedule as this round's plan in one row, whatever was dispatched so far.
+
+        tasks and agents int64 (K,) are the pairs in order of dispatch, counted from 0, each task at most once and
+        each pair eligible; K below the number of tasks leaves the round stuck. Only in `plan` mode. Raises
+        IllegalActionError for anything else.
+        """
+        instance, tasks, agents = self.instances[row], np.asarray(tasks, np.int64), np.asarray(agents, np.int64)
+        if self.mode != "plan":
+            raise IllegalActionError("play_round: a whole schedule can only be given in plan mode")
+        if self.acting[row] == NOBODY:
+            raise IllegalActionError("play_round: the episode is over, call reset()")
+        inside = (tasks >= 0) & (tasks < instance.n_tasks) & (agents >= 0) & (agents < instance.n_agents)
+        if not inside.all() or not instance.eligible[tasks, agents].all():
+            raise IllegalActionError("play_round: expected eligible pairs of a task and an agent of this instance")
+        if len(np.unique(tasks)) != len(tasks):
+            raise IllegalActionError("play_round: a task is dispatched twice")
+        dynamics.play_round(self.state, self.rules, row, tasks, agents)
+
+    def dispatchable(self, row: int, task: int, agent: int) -> bool:
+        """Whether an agent could in truth commit to a task, counted from 0, at this moment."""
+        return bool(dynamics.dispatchable(self.state, row, task, agent))
+
+    def observe(self, agents: np.ndarray, out: Observation | None = None) -> Observation:
+        """The graph each row's agent sees under the simulator's view; see TurnSimulator.observe."""
+        return self._observe(agents, self.view.limits, out)
+
+    def observe_all(self) -> Observation:
+        """The acting agents' graphs under the full view."""
+        return self._observe(self.acting, FullView().limits, None)
+
+    def _observe(self, agents: np.ndarray, limits: tuple[float, float], out: Observation | None) -> Observation:
+        out = self.new_observation() if out is None else out
+        reverse = dict(zip(("aug", "aug_attributes"), self._no_reverse, strict=True))
+        arrays = graph.Arrays(*[out[name] if name in out else reverse[name] for name in graph.Arrays._fields])
+        graph.observe(self.state, self.rules, np.asarray(agents, np.int64), *limits, arrays)
+        return out
+
+    def free_agents(self, row: int) -> np.ndarray:
+        """Agents that have still to act at this moment, in turn order as things stand."""
+        if self.over[row]:
+            return np.empty(0, np.int64)
+        free_at = self.state.agents["free_at"][row, : self.n_agents[row]]
+        free = np.flatnonzero(free_at <= self.state.rows["clock"][row])
+        keys = [dynamics.preference(self.state, self.rules.picking, row, int(agent)) for agent in free]
+        return free[np.argsort(keys, kind="stable")]
+
+    def objectives(self) -> dict[str, np.ndarray]:
+        """Means over the rounds that have ended, float64 (B,); 0 before the first has.
+
+        makespan and weighted are adjusted: an infeasible round counts with the worst case, the largest sum of one
+        agent's durations over all tasks (times the sum of weights). Conflicts are summed.
+        """
+        state = self.state
+        ended = np.arange(self.horizon) < state.rows["round"][:, None]
+        n = np.maximum(ended.sum(axis=1), 1)
+        rounds, weights = state.rounds, state.tasks["weight"].sum(axis=1)[:, None]
+        feasible = rounds["feasible"] & ended
+        measures = {
+            "makespan": np.where(feasible, rounds["makespan"], rounds["worst"]),
+            "weighted": np.where(feasible, rounds["weighted"], rounds["worst"] * weights),
+            "feasible": feasible,
+        }
+        means = {name: np.where(ended, values, 0).sum(axis=1) / n for name, values in measures.items()}
+        return means | {"conflicts": np.where(ended, rounds["conflicts"], 0).sum(axis=1).astype(np.float64)}
+
+    def round_results(self, row: int) -> np.ndarray:
+        """A copy of the ended rounds' results, state.ROUND (n,)."""
+        return self.state.rounds[row, : self.state.rows["round"][row]].copy()
+
+    def snapshot(self, row: int) -> dict[str, np.ndarray]:
+        """Copies of a row's state, without its instance's constants."""
+        names = ("rows", "tasks", "agents", "pairs", "filters", "order", "told", "rounds", "executed")
+        return {name: getattr(self.state, name)[row].copy() for name in names}
+
+
+def _code(what: str, name: str, known: tuple[str, ...]) -> int:
+    return known.index(require(what, name, known))
