@@ -23,19 +23,15 @@ from marl_sched.train.evaluate import Settings
 SECONDS, SCORE = "seconds", "validation"  # the columns of a training log that are drawn
 
 
-def draw_scores(results: Mapping[str, Any], path: Path) -> Path:
-    """The bars of an evaluation (schema 1) as a picture; its path."""
-    return plots.save(plots.score_bars(results), path)
+def draw_scores(path: Path, *results: Mapping[str, Any]) -> Path:
+    """The bars of one or more evaluations (schema 1) as a picture; its path."""
+    return plots.save(plots.score_bars(*results), path)
 
 
-def draw_timelines(
-    domain: Domain, schedulers: Mapping[str, Scheduler], instance: Any, settings: Settings, path: Path
-) -> Path:
-    """Episode 0 of one instance as each scheduler plays it, one above the other, as a picture; its path."""
-    objective = str(settings.filled_in(domain).objective)
+def draw_timelines(path: Path, domain: Domain, episodes: Mapping[str, TurnSimulator], objective: str) -> Path:
+    """Finished episodes, caption -> what `play_episode` returned, one above the other as a picture; its path."""
     panels, hours = {}, 0
-    for name, scheduler in schedulers.items():
-        simulator = play_episode(domain, scheduler, instance, settings)
+    for name, simulator in episodes.items():
         score = simulator.objectives()[objective][0]
         panels[f"{name}: {objective} {score:.3f}"] = domain.render["rgb_array"](simulator, 0)
         hours = max(hours, int(simulator.time[0]))
@@ -44,7 +40,7 @@ def draw_timelines(
     return plots.save(plots.timelines(panels, hours=hours, legend=legend, band=band, title=title), path)
 
 
-def draw_learning_curves(logs: Iterable[Path], path: Path) -> Path:
+def draw_learning_curves(path: Path, logs: Iterable[Path]) -> Path:
     """The learning curves of training logs, each named after its run's folder, as a picture; its path."""
     curves = {log.absolute().parent.name: read_learning_curve(log) for log in logs}
     return plots.save(plots.learning_curves(curves), path)

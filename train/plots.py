@@ -12,11 +12,13 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from marl_sched.files import replacing
 
-_BAR, _ACCENT, _INK, _FAINT = "#8fb8d8", "#2b6a9b", "#22303c", "#c9d1d8"
+_INK, _FAINT = "#22303c", "#c9d1d8"
+_BARS = ("#8fb8d8", "#f0b96b", "#a7cfa4", "#c6b3dc")
 _LINES = ("#2b6a9b", "#cb4335", "#e08e0b", "#3c8d5a", "#7d5ba6", "#5d6d7e")
 
 
@@ -27,33 +29,37 @@ def save(figure: Figure, path: Path) -> Path:
     return path
 
 
-def score_bars(results: Mapping[str, Any]) -> Figure:
-    """M1 of every scheduler of an evaluation (schema 1): interquartile mean with its interval, and mean."""
-    rows = sorted(results["schedulers"].items(), key=lambda item: item[1]["M1"]["mean"])
-    names = [name for name, _ in rows]
-    scores = [row["M1"] for _, row in rows]
+def score_bars(*tables: Mapping[str, Any]) -> Figure:
+    """M1 of the schedulers of one or more evaluations (schema 1): interquartile mean with its interval, and mean.
+
+    Tables differ in colour and are told apart by their views.
+    """
+    rows = [(name, row["M1"], i) for i, table in enumerate(tables) for name, row in table["schedulers"].items()]
+    rows.sort(key=lambda row: row[1]["mean"])
+    scores = [score for _, score, _ in rows]
     iqm = np.array([score["iqm"] for score in scores])
     low, high = np.array([score["ci95"] for score in scores]).T
-    figure = Figure(figsize=(8.0, 1.6 + 0.42 * len(rows)), layout="constrained")
+    means = np.array([score["mean"] for score in scores])
+    figure = Figure(figsize=(8.5, 1.7 + 0.4 * len(rows)), layout="constrained")
     axes = figure.add_subplot()
     y = np.arange(len(rows))
-    axes.barh(y, iqm, color=_BAR, height=0.62, label="interquartile mean")
-    axes.errorbar(
-        iqm, y, xerr=(iqm - low, high - iqm), fmt="none", ecolor=_INK, capsize=3, lw=1.3, label="its 95 % interval"
-    )
-    axes.plot([score["mean"] for score in scores], y, "D", color=_ACCENT, ms=4.5, mec="white", mew=0.6, label="mean")
-    right = max(0.0, high.max(), max(score["mean"] for score in scores))
-    for position, bound, score in zip(y, high, scores, strict=True):
-        beside = max(bound, score["mean"], 0.0) + 0.015 * right
-        axes.text(beside, position, f"{score['mean']:.3f}", va="center", fontsize=9, color=_INK)
-    axes.set_yticks(y, names)
+    axes.barh(y, iqm, color=[_BARS[table % len(_BARS)] for _, _, table in rows], height=0.62)
+    axes.errorbar(iqm, y, xerr=(iqm - low, high - iqm), fmt="none", ecolor=_INK, capsize=3, lw=1.3)
+    axes.plot(means, y, "D", color=_INK, ms=4, mec="white", mew=0.6)
+    right = max(0.0, high.max(), means.max())
+    for position, bound, mean in zip(y, high, means, strict=True):
+        axes.text(max(bound, mean, 0.0) + 0.015 * right, position, f"{mean:.3f}", va="center", fontsize=9, color=_INK)
+    axes.set_yticks(y, [name for name, _, _ in rows])
     axes.set_xlim(min(0.0, 1.05 * low.min()), 1.12 * right or 1.0)
-    axes.set_xlabel(f"M1: mean {results['objective']} over {results['hours']} hours")
-    axes.set_title(_conditions(results), fontsize=10, loc="left")
+    axes.set_xlabel(f"M1: mean {tables[0]['objective']} over {tables[0]['hours']} hours")
+    axes.set_title(_conditions(tables[0]), fontsize=10, loc="left")
     _plain(axes)
     axes.grid(axis="x", color=_FAINT, lw=0.6)
     axes.tick_params(axis="y", length=0)
-    figure.legend(loc="outside lower right", ncols=3, frameon=False, fontsize=8)
+    handles: list[Any] = [Patch(color=_BARS[i % len(_BARS)], label=_view(table)) for i, table in enumerate(tables)]
+    handles.append(Line2D([], [], color=_INK, marker="|", ms=8, label="95 % interval of the interquartile mean (bar)"))
+    handles.append(Line2D([], [], color=_INK, marker="D", ms=4, ls="none", label="mean"))
+    figure.legend(handles=handles, loc="outside lower right", ncols=len(handles), frameon=False, fontsize=8)
     return figure
 
 
@@ -121,12 +127,13 @@ def learning_curves(curves: Mapping[str, tuple[np.ndarray, np.ndarray]], *, meas
 
 
 def _conditions(results: Mapping[str, Any]) -> str:
-    view = results["view"]
     scale = results["scale"] or "given"
-    return (
-        f"{results['env']}, {results['instances']} {scale} instances x {results['episodes']} episodes, "
-        f"{view['kind']} view ({100 * view['visible_share']:.0f} % of the graph seen)"
-    )
+    return f"{results['env']}, {results['instances']} {scale} instances x {results['episodes']} episodes"
+
+
+def _view(results: Mapping[str, Any]) -> str:
+    view = results["view"]
+    return f"{view['kind']} view, {100 * view['visible_share']:.0f} % seen"
 
 
 def _plain(axes: Axes) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -67,17 +67,17 @@ class Plant:
         from marl_sched.domain import get_domain
 
         options.check_output(json)
-        given = {name: getattr(self, name) for name in options.VIEW_OPTIONS if getattr(self, name) is not None}
-        options.build_view(get_domain(self.env), self.view, given)
+        typed = {name: getattr(self, name) for name in options.VIEW_OPTIONS}
+        view = options.build_view(get_domain(self.env), self.view, typed)
         return WorldOptions(
             env=self.env,
-            scale="" if self.instance else self.scale,
+            scale=self.scale,
             instance=str(self.instance or ""),
             seed=self.seed,
             hours=self.hours or 0,
             objective=self.objective or "",
             view=self.view,
-            view_options=given,
+            view_options=asdict(view),
             run=self.run,
             listen=listen,
             deadline=self.deadline,

@@ -49,12 +49,12 @@ def compare(
     """As evaluate, and draw the scores, an episode of every scheduler and the learning curves of training logs."""
     from marl_sched.cli.tables import print_scores
     from marl_sched.files import write_json
-    from marl_sched.train.compare import draw_learning_curves, draw_scores, draw_timelines
+    from marl_sched.train.compare import draw_learning_curves, draw_scores, draw_timelines, play_episode
 
     options.check_folder(out)
     options.check_output(json)
     if log:  # first, as a log may be malformed
-        typer.echo(draw_learning_curves(log, out / "learning.png"))
+        typer.echo(draw_learning_curves(out / "learning.png", log))
     resolved = selection.resolve()
     results = play(resolved, selection.baseline)
     for path in (out / "results.json", json):
@@ -62,9 +62,13 @@ def compare(
             write_json(path, results)
     print_scores(results)
     typer.echo(out / "results.json")
-    typer.echo(draw_scores(results, out / "scores.png"))
-    shown = (resolved.domain, resolved.schedulers, resolved.instances[0], resolved.settings)
-    typer.echo(draw_timelines(*shown, out / "timelines.png"))
+    typer.echo(draw_scores(out / "scores.png", results))
+    domain, settings = resolved.domain, resolved.settings.filled_in(resolved.domain)
+    episodes = {
+        name: play_episode(domain, scheduler, resolved.instances[0], settings)
+        for name, scheduler in resolved.schedulers.items()
+    }
+    typer.echo(draw_timelines(out / "timelines.png", domain, episodes, str(settings.objective)))
 
 
 def play(resolved: Resolved, baseline: str | None) -> dict[str, Any]:
