@@ -137,16 +137,21 @@ class SchedulingParallel(ParallelEnv):
                 best[target] = min(best.get(target, bid), bid)
         return {agent for agent, target in choices.items() if target > 0 and best[target][1] != agent}
 
-    def _play(self, choices: Mapping[int, int]) -> tuple[float, set[int]]:
-        """Take the moment's turns in the simulator's order; the team reward and who met with a conflict."""
+    def _play(self, choices: dict[int, int]) -> tuple[float, set[int]]:
+        """Take the moment's turns in the simulator's order; the team reward and who met with a conflict.
+
+        A turn may end the moment for agents that have not had theirs, as the last task of a MuRSE round does;
+        their choices lapse.
+        """
         reward = 0.0
         conflicts: set[int] = set()
+        simulator = self.simulator
         for _ in choices:
-            agent = int(self.simulator.acting[0])
+            agent = int(simulator.acting[0])
             reward += self._single.step(choices[agent])
-            if self.simulator.conflict[0]:
+            if simulator.conflict[0]:
                 conflicts.add(agent)
-            if self._single.over:
+            if self._single.over or simulator.elapsed[0] > 0:
                 break
         return reward, conflicts
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import gymnasium
 
-DOMAINS = {"marl_sched/AirME-v0": "airme"}
+DOMAINS = {"marl_sched/AirME-v0": "airme", "marl_sched/MuRSE-v0": "murse"}
 
 
 def register() -> None:

@@ -8,7 +8,7 @@ import pytest
 from marl_sched.envs.aec import SchedulingAEC
 from marl_sched.envs.gymnasium_env import SchedulingEnv
 
-HORIZON = 60
+HORIZON = {"airme": 60, "murse": 3}  # hours, rounds
 SEED = 11
 ROW, BATCH = 17, 64
 
@@ -27,7 +27,7 @@ def instance(domain, request):
 @pytest.fixture
 def trace(domain, view, instance, pick, bits):
     """An AEC episode: one dict per turn."""
-    env = SchedulingAEC(domain, instance=instance, view=view, horizon=HORIZON)
+    env = SchedulingAEC(domain, instance=instance, view=view, horizon=HORIZON[domain.name])
     env.reset(seed=SEED)
     turns = []
     while not any(env.terminations.values()) and not any(env.truncations.values()):
@@ -52,7 +52,7 @@ def test_aec_and_torchrl_agree(domain, view, instance, trace, bits, row, batch):
 
     instances = domain.instances("small", batch, SEED + 1)
     instances[row] = instance
-    env = SchedulingTorchRL(domain, instances=instances, view=view, horizon=HORIZON, seed=SEED)
+    env = SchedulingTorchRL(domain, instances=instances, view=view, horizon=HORIZON[domain.name], seed=SEED)
     td = env.reset()
     for turn in trace:
         assert domain.agent_name(int(td["acting"][row])) == turn["agent"]
@@ -68,12 +68,12 @@ def test_aec_and_torchrl_agree(domain, view, instance, trace, bits, row, batch):
 @pytest.mark.parametrize("domain", ["airme"], indirect=True)
 @pytest.mark.parametrize("view", ["full"], indirect=True)
 def test_aec_and_gymnasium_agree(domain, instance, trace, bits):
-    env = SchedulingEnv(domain, instance=instance, horizon=HORIZON)
+    env = SchedulingEnv(domain, instance=instance, horizon=HORIZON[domain.name])
     observation, _ = env.reset(seed=SEED)
     turns = iter(trace)
     turn = next(turns)
     paid = 0.0
-    for hour in range(HORIZON):
+    for hour in range(HORIZON[domain.name]):
         action = np.zeros(env.simulator.max_agents, np.int64)
         if turn is not None and turn["time"] == hour:
             # AEC lets the hours pass in which all crews are busy; what a step brought is not part of the state.

@@ -14,12 +14,12 @@ from marl_sched.envs.airme.instance import AirmeInstance
 from marl_sched.envs.gymnasium_env import SchedulingEnv
 from marl_sched.errors import IllegalActionError, InvalidOptionError, UnknownNameError
 
-HORIZON = 40
-IDS = {"airme": "marl_sched/AirME-v0"}
+HORIZON = {"airme": 40, "murse": 2}  # hours, rounds
+IDS = {"airme": "marl_sched/AirME-v0", "murse": "marl_sched/MuRSE-v0"}
 
 
 def make(domain, **options):
-    return SchedulingEnv(domain, **{"horizon": HORIZON, **options})
+    return SchedulingEnv(domain, **{"horizon": HORIZON[getattr(domain, "name", domain)], **options})
 
 
 def fleet(n_planes, n_crews):
@@ -37,11 +37,13 @@ def fleet(n_planes, n_crews):
 def test_passes_gymnasiums_checker_under_its_registered_name(domain):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_env(gymnasium.make(IDS[domain.name], horizon=HORIZON).unwrapped)
+        check_env(gymnasium.make(IDS[domain.name], horizon=HORIZON[domain.name]).unwrapped)
 
 
 def test_importing_the_package_registers_the_environments():
-    program = "import marl_sched, gymnasium; assert 'marl_sched/AirME-v0' in gymnasium.registry"
+    program = (
+        "import marl_sched, gymnasium; assert {'marl_sched/AirME-v0', 'marl_sched/MuRSE-v0'} <= set(gymnasium.registry)"
+    )
     subprocess.run([sys.executable, "-c", program], check=True)
     assert marl_sched.__all__
 
@@ -160,7 +162,7 @@ def test_unknown_options_raise(domain):
 
 def test_render_modes_draw(domain):
     for mode in domain.render:
-        env = gymnasium.make(IDS[domain.name], horizon=HORIZON, render_mode=mode)
+        env = gymnasium.make(IDS[domain.name], horizon=HORIZON[domain.name], render_mode=mode)
         env.reset(seed=1)
         env.step(env.action_space.sample())
         assert env.render() is not None
