@@ -42,8 +42,8 @@ class LocalView:
 
     kind = "local"
 
-    sensing: float = 2.0  # map units
-    comm: float = 2.0
+    sensing: float = 4.0  # map units
+    comm: float = 4.0
 
     def __post_init__(self) -> None:
         """Refuse negative options."""
