@@ -165,7 +165,7 @@ class Agent:
             if event.key == wire.CLOCK:
                 return wire.decode(event.payload, wire.Clock)
             if event.key == self._keys.turn(self.agent):
-                said = wire.decode(event.payload, wire.Turn, wire.Welcome, wire.Fenced)
+                said: wire.ToAgent = wire.decode(event.payload, wire.Turn, wire.Welcome, wire.Fenced)
                 return said if said.incarnation == self._incarnation and said.agent == self.agent else None
             self._learn(event.key, wire.decode(event.payload, wire.News))
         except InvalidMessageError as error:

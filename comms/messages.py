@@ -21,7 +21,7 @@ is the new state of the agent's own channel, versioned and repaired like every o
 from __future__ import annotations
 
 import re
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, overload
 
 import msgspec
 
@@ -35,7 +35,7 @@ class Message(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     """The tag names a message's type and version: a reader of another version refuses it."""
 
 
-class Frame(Message, tag="frame.1"):
+class Frame(Message, tag="frame.1", frozen=True):
     """What an agent needs to build its empty belief."""
 
     env: str
@@ -43,34 +43,34 @@ class Frame(Message, tag="frame.1"):
     problem: bytes  # of the domain's telemetry
 
 
-class Clock(Message, tag="clock.1"):
+class Clock(Message, tag="clock.1", frozen=True):
     """Where the run stands; `tick` is simulated time."""
 
     tick: Natural
     phase: Phase
 
 
-class News(Message, tag="news.1"):
+class News(Message, tag="news.1", frozen=True):
     """A channel's newest state; the sequence counts the states of this channel from 1."""
 
     sequence: Natural
     payload: bytes
 
 
-class Snapshot(Message, tag="snapshot.1"):
+class Snapshot(Message, tag="snapshot.1", frozen=True):
     """The newest state of all channels of an agent."""
 
     clock: Clock
     channels: dict[str, News]
 
 
-class SnapshotRequest(Message, tag="snapshot-request.1"):
+class SnapshotRequest(Message, tag="snapshot-request.1", frozen=True):
     """Whose channels are asked for."""
 
     agent: Natural
 
 
-class Hello(Message, tag="hello.1"):
+class Hello(Message, tag="hello.1", frozen=True):
     """An agent is ready to decide."""
 
     agent: Natural
@@ -78,14 +78,14 @@ class Hello(Message, tag="hello.1"):
     policy: str
 
 
-class Welcome(Message, tag="welcome.1"):
+class Welcome(Message, tag="welcome.1", frozen=True):
     """The world counts on this incarnation."""
 
     agent: Natural
     incarnation: str
 
 
-class Fenced(Message, tag="fenced.1"):
+class Fenced(Message, tag="fenced.1", frozen=True):
     """The world does not count on this incarnation; it may come back as another one, if `reason` allows."""
 
     agent: Natural
@@ -93,7 +93,7 @@ class Fenced(Message, tag="fenced.1"):
     reason: str
 
 
-class Turn(Message, tag="turn.1"):
+class Turn(Message, tag="turn.1", frozen=True):
     """An agent is to decide. `noise` is the uniform in [0, 1) of its own sampling stream at this moment.
 
     The key of the run's noise is not told: with it an agent could foretell failures.
@@ -107,7 +107,7 @@ class Turn(Message, tag="turn.1"):
     needs: dict[str, Natural]  # channel -> sequence
 
 
-class Decision(Message, tag="decision.1"):
+class Decision(Message, tag="decision.1", frozen=True):
     """The answer to the turn with the same tick, agent, incarnation and sequence."""
 
     tick: Natural
@@ -122,6 +122,8 @@ class Decision(Message, tag="decision.1"):
         return mine == (turn.tick, turn.agent, turn.incarnation, turn.sequence)
 
 
+ToAgent = Turn | Welcome | Fenced
+
 M = TypeVar("M", bound=Message)
 _encoder = msgspec.msgpack.Encoder()
 
@@ -131,19 +133,22 @@ def encode(message: Message) -> bytes:
     return _encoder.encode(message)
 
 
-def decode(payload: bytes, *kinds: type[M]) -> M:
+@overload
+def decode(payload: bytes, kind: type[M], /) -> M: ...
+@overload
+def decode(payload: bytes, *kinds: type[Message]) -> Any: ...
+def decode(payload: bytes, *kinds: type[Message]) -> Any:
     """The message in `payload`, one of `kinds`; InvalidMessageError if it is anything else."""
     try:
-        message: M = _decoder(kinds).decode(payload)
+        return _decoder(kinds).decode(payload)
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise InvalidMessageError(f"not a {' or '.join(kind.__name__ for kind in kinds)}: {error}") from error
-    return message
 
 
 _decoders: dict[tuple[type[Message], ...], msgspec.msgpack.Decoder] = {}
 
 
-def _decoder(kinds: tuple[type[M], ...]) -> msgspec.msgpack.Decoder:
+def _decoder(kinds: tuple[type[Message], ...]) -> msgspec.msgpack.Decoder:
     if kinds not in _decoders:
         union = kinds[0]
         for kind in kinds[1:]:

@@ -201,8 +201,11 @@ class World:
     def _hear(self, event: Event) -> wire.Decision | None:
         self.books.note_heard(event.key, event.payload)
         agent, leaf, _ = self._keys.parse(event.key)
-        kind = wire.Decision if leaf == "decision" else wire.Hello
-        said = wire.decode(event.payload, kind)
+        said: wire.Decision | wire.Hello
+        if leaf == "decision":
+            said = wire.decode(event.payload, wire.Decision)
+        else:
+            said = wire.decode(event.payload, wire.Hello)
         if said.agent != agent:
             raise InvalidMessageError(f"{event.key}: speaks for agent {said.agent}")
         if isinstance(said, wire.Decision):

@@ -63,7 +63,7 @@ class Telemetry(Protocol):
 
     Both sides are pure: bytes out, bytes in, no transport. A channel is the part of a key after the run's name;
     its payload is a state, not a change, so the newest one is all that a late listener needs. All methods of
-    the world's side speak of row 0.
+    the world's side speak of row 0 of the domain's own simulator.
 
     Attributes:
         moment: what a unit of simulated time is called in reports, such as "hour".
@@ -71,13 +71,13 @@ class Telemetry(Protocol):
 
     moment: str
 
-    def frame(self, simulator: TurnSimulator) -> bytes:
+    def frame(self, simulator: Any) -> bytes:
         """What every agent is told at the start: sizes, padding and view, nothing that a view hides."""
 
-    def messages(self, simulator: TurnSimulator) -> dict[str, bytes]:
+    def messages(self, simulator: Any) -> dict[str, bytes]:
         """Everything the world says at this moment: channel -> payload."""
 
-    def series(self, simulator: TurnSimulator) -> dict[str, list[float]]:
+    def series(self, simulator: Any) -> dict[str, list[float]]:
         """The objectives of every moment so far, name -> one value per moment."""
 
     def belief(self, frame: bytes, agent: int) -> Belief:

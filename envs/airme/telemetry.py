@@ -41,7 +41,7 @@ class _Payload(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """A payload names its type and the type's version, so that a reader of another version refuses it."""
 
 
-class Frame(_Payload, tag="airme.frame.1"):
+class Frame(_Payload, tag="airme.frame.1", frozen=True):
     """What every crew is told at the start: the sizes, the types' usage and the view."""
 
     n_planes: Size
@@ -74,14 +74,14 @@ class PlaneStatus(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_f
 _SEEN = tuple(name for name in PlaneStatus.__struct_fields__ if name not in ("slot", "in_hand"))
 
 
-class Sector(_Payload, tag="airme.sector.1"):
+class Sector(_Payload, tag="airme.sector.1", frozen=True):
     """A sector's planes as they were at the start of `hour`."""
 
     hour: Hour
     planes: list[PlaneStatus]
 
 
-class CrewStatus(_Payload, tag="airme.crew.1"):
+class CrewStatus(_Payload, tag="airme.crew.1", frozen=True):
     """A crew at a moment of `hour`; see dynamics.CREW."""
 
     hour: Hour
@@ -98,7 +98,7 @@ class Told(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=T
     plane: PlaneStatus
 
 
-class Memory(_Payload, tag="airme.told.1"):
+class Memory(_Payload, tag="airme.told.1", frozen=True):
     """All that a crew learnt by itself and that is not older than the pictures of other sectors."""
 
     planes: list[Told]
@@ -176,7 +176,7 @@ class AirmeTelemetry:
                 planes = _statuses(state.past[0, pictured % (staleness + 1)], slots, with_chosen=False)
                 said[f"plane/{sector}/delayed"] = _encode(Sector(hour=pictured, planes=planes))
         for crew in range(n_crews):
-            record = {name: int(state.crews[0, crew][name]) for name in CREW.names}
+            record = {name: int(state.crews[0, crew][name]) for name in CREW.names or ()}
             said[f"crew/{crew}/status"] = _encode(CrewStatus(hour=now, **record))
             if staleness:
                 said[f"crew/{crew}/told"] = _encode(_memory(state, crew, pictured))
@@ -250,7 +250,7 @@ class AirmeBelief:
         if max(said.plane, said.choice) > self._frame.n_planes:
             raise InvalidMessageError(f"crew {crew}: a plane beyond the {self._frame.n_planes} that there are")
         record = self._state.crews[0, crew]
-        for name in CREW.names:
+        for name in CREW.names or ():
             record[name] = getattr(said, name)
         if crew == self._agent:
             self._state.rows["time"] = said.hour  # its own clock: the moment at which the crew decides
