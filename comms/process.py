@@ -9,6 +9,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import fields
 from types import FrameType
@@ -20,6 +21,7 @@ from marl_sched.errors import InvalidOptionError, MarlSchedError
 
 T = TypeVar("T")
 USER_ERROR = 2
+LAST_WORDS = 2.0  # seconds to end tidily in when the parent is gone
 
 
 def parse_options(text: str, kind: type[T]) -> T:
@@ -66,6 +68,8 @@ def _end_with_parent() -> None:
     while os.read(0, 1024):  # unbuffered: a buffered read here would block the interpreter's end
         pass
     os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(LAST_WORDS)
+    os._exit(128 + signal.SIGTERM)  # the main thread is stuck, and nobody is left to end it
 
 
 def _print_progress(phase: str, moment: int, horizon: int) -> None:

@@ -11,6 +11,7 @@ import json
 import queue
 import re
 import socket
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Literal, NamedTuple, Protocol
@@ -21,6 +22,7 @@ from marl_sched.comms.messages import run_prefix
 from marl_sched.errors import DeploymentError, InvalidOptionError
 
 LEASE_MS = 1000
+CONNECT_SLICE = 1.0  # seconds for which an attempt to connect may keep a process from hearing signals
 _ENDPOINT = re.compile(r"tcp/(?P<host>[^\s/:]+|\[[0-9a-fA-F:]+\]):(?P<port>\d{1,5})")
 EventKind = Literal["message", "alive", "gone", "query"]
 
@@ -153,14 +155,23 @@ def hub(run: str, endpoint: str) -> Iterator[Link]:
 def spoke(run: str, endpoint: str, timeout: float) -> Iterator[Link]:
     """An agent's session, connected to the world's endpoint; waits up to `timeout` seconds for it."""
     check_endpoint("connect", endpoint)
-    retry = {"period_init_ms": 100, "period_max_ms": 400, "period_increase_factor": 2.0}
-    connect = {"endpoints": [endpoint], "timeout_ms": int(timeout * 1000), "exit_on_failure": True, "retry": retry}
-    try:
-        session = zenoh.open(_config(mode="client", connect=connect))
-    except zenoh.ZError as error:
-        raise DeploymentError(f"no world at {endpoint} within {timeout:g} s") from error
+    end = time.monotonic() + timeout
+    while (session := _connect(endpoint, min(CONNECT_SLICE, end - time.monotonic()))) is None:
+        if time.monotonic() >= end:
+            raise DeploymentError(f"no world at {endpoint} within {timeout:g} s")
     with session:
         yield Link(session, run)
+
+
+def _connect(endpoint: str, seconds: float) -> zenoh.Session | None:
+    """A session connected to an endpoint, None if there was no answer in time. Signals wait for it to return."""
+    retry = {"period_init_ms": 100, "period_max_ms": 400, "period_increase_factor": 2.0}
+    timeout_ms = max(int(seconds * 1000), 1)
+    connect = {"endpoints": [endpoint], "timeout_ms": timeout_ms, "exit_on_failure": True, "retry": retry}
+    try:
+        return zenoh.open(_config(mode="client", connect=connect))
+    except zenoh.ZError:
+        return None
 
 
 def _config(**sections: Any) -> zenoh.Config:

@@ -198,6 +198,7 @@ def noise_on(run, key: str, payload: bytes) -> None:
 
 
 FOREIGN = wire.encode(wire.Decision(tick=0, agent=1, incarnation="forged", sequence=1, target=5))
+BEYOND = wire.encode(wire.Decision(tick=0, agent=99, incarnation="", sequence=0, target=0))
 
 
 @pytest.mark.parametrize(
@@ -208,7 +209,7 @@ FOREIGN = wire.encode(wire.Decision(tick=0, agent=1, incarnation="forged", seque
         ("crew/x/decision", FOREIGN, "unparsed"),
         ("crew/2/decision", FOREIGN, "unparsed"),  # speaks for crew 1
         ("crew/1/decision", FOREIGN, "stale"),
-        ("crew/99/decision", wire.encode(wire.Decision(tick=0, agent=99, incarnation="", sequence=0, target=0)), "stale"),
+        ("crew/99/decision", BEYOND, "stale"),
         ("crew/1/hello", FOREIGN, "unparsed"),
     ],
 )  # fmt: skip
@@ -273,7 +274,7 @@ def test_agent_for_a_crew_that_does_not_exist_says_so(make_run):
 
 
 def test_replaced_policy_changes_nobody_else_before_they_meet(make_run):
-    given = options(hours=60, **{"view_options": {"reach": 0, "comm": 0}})
+    given = options(hours=60, view_options={"reach": 0, "comm": 0})
     plain = make_run(given, ["condition"] * 7).play()["decisions"]
     other = make_run(given, ["condition"] * 3 + ["random"] + ["condition"] * 3).play()["decisions"]
     assert [d for d in plain if d["agent"] == "crew_3"] != [d for d in other if d["agent"] == "crew_3"]
