@@ -24,7 +24,9 @@ from torch import Tensor
 from marl_sched.domain import Domain
 from marl_sched.envs.torchrl_env import SchedulingTorchRL
 
-_INSTANCES = 1  # second word of the seeds of training instances; Domain.instances uses seeds of another length
+# Last word of the seeds of training instances, to tell them from those of Domain.instances: [seed, i] and
+# [seed, i, 0] are the same seed to numpy.
+_TRAINING = 1
 
 Act = Callable[[dict[str, Tensor], np.ndarray], tuple[Tensor, Tensor]]
 """(observations, uniforms float64 (B,)) -> targets int64 (B,) and their log-probabilities float32 (B,)."""
@@ -77,7 +79,7 @@ class InstanceSource:
     def __call__(self, row: int, count: int) -> Any:
         """The instance that a row plays in its episode `count`."""
         number = (count * self._rows + row) // self._episodes
-        rng = np.random.default_rng([self._seed, _INSTANCES, number])
+        rng = np.random.default_rng([self._seed, number, _TRAINING])
         return self._domain.generate(self._scales[number % len(self._scales)], rng)
 
 

@@ -19,7 +19,7 @@ from marl_sched.train.parts import Counters, build
 from marl_sched.train.ppo import Sampler, samples_of
 
 CONFIG = "config.json"
-_SAMPLES = 2  # second word of the seeds that pick and order samples
+_SAMPLES = 2  # last word of the seeds that pick and order samples
 
 
 def train_from_overrides(overrides: Sequence[str], *, quiet: bool = False) -> Path:
@@ -57,7 +57,7 @@ def train(
             update = counters.update
             rollout = parts.collector.collect(Sampler(parts.ppo.policy), parts.length(update))
             estimate = parts.estimator.estimate(rollout)
-            rng = np.random.default_rng([config.seed, _SAMPLES, update])
+            rng = np.random.default_rng([config.seed, update, _SAMPLES])
             samples = samples_of(parts.graph, rollout, estimate, config.algorithm.ppo.keep_least, rng)
             report = parts.ppo.update(samples, update / config.updates, rng)
             counters.add(rollout)

@@ -1,0 +1,121 @@
+"""Advantage estimators against numbers worked out by hand and against slow, plain implementations."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from marl_sched.train.advantages import (
+    generalised_advantages,
+    normalised,
+    returns_by_time,
+    step_baseline_advantages,
+)
+
+NAN = float("nan")
+
+
+def column(*values: float) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64)[:, None]
+
+
+def flags(*values: int) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.bool)[:, None]
+
+
+def test_a_turn_within_a_moment_discounts_nothing_and_one_that_passes_time_discounts_by_it():
+    # Two turns in one moment, the second lets 2 units pass. gamma = 1/2, lambda = 1.
+    # delta_1 = 3 + 0.25 * 8 - 1 = 4; delta_0 = 0 + 1 * 1 - 2 = -1; A_1 = 4; A_0 = -1 + 1 * 4 = 3.
+    advantages, targets = generalised_advantages(
+        column(0, 3), column(0, 2), column(2, 1, 8), flags(1, 1, 1), flags(1, 1, 1), discount=0.5, trace=1.0
+    )
+    assert advantages[:, 0].tolist() == [3.0, 4.0]
+    assert targets[:, 0].tolist() == [5.0, 5.0]
+
+
+def test_the_trace_fades_with_simulated_time():
+    # gamma = 1, lambda = 1/2, no values: A_2 = 8, A_1 = 4 + (1/2)^2 * 8 = 6, A_0 = 2 + (1/2)^0 * 6 = 8.
+    ones = flags(1, 1, 1, 1)
+    advantages, _ = generalised_advantages(
+        column(2, 4, 8), column(0, 2, 1), column(0, 0, 0, 0), ones, ones, discount=1.0, trace=0.5
+    )
+    assert advantages[:, 0].tolist() == [8.0, 6.0, 8.0]
+
+
+def test_an_end_is_worth_nothing_and_a_cut_is_worth_its_value():
+    rewards, elapsed, values, valid = column(1, 1), column(1, 1), column(0, 0, 100), flags(1, 1, 0)
+    ended, _ = generalised_advantages(rewards, elapsed, values, valid, flags(1, 1, 0), discount=0.5, trace=0.0)
+    cut, _ = generalised_advantages(rewards, elapsed, values, valid, flags(1, 1, 1), discount=0.5, trace=0.0)
+    assert ended[:, 0].tolist() == [1.0, 1.0]
+    assert cut[:, 0].tolist() == [1.0, 51.0]
+
+
+def test_nothing_reaches_over_a_cut_into_the_next_episode():
+    # Turn 1 is a cut: its state counts as turn 0's future, what the next episode brings does not.
+    advantages, _ = generalised_advantages(
+        column(1, NAN, 1000), column(1, 1, 1), column(0, 6, 0, 0), flags(1, 0, 1, 1), flags(1, 1, 1, 1),
+        discount=0.5, trace=1.0,
+    )  # fmt: skip
+    assert advantages[:, 0].tolist() == [4.0, 0.0, 1000.0]
+
+
+def test_masked_turns_may_hold_nan():
+    valid, alive = flags(1, 0, 0), flags(1, 0, 0)
+    advantages, targets = generalised_advantages(
+        column(2, NAN), column(1, NAN), column(0, NAN, NAN), valid, alive, discount=0.9, trace=0.9
+    )
+    assert advantages[:, 0].tolist() == [2.0, 0.0]
+    assert targets[:, 0].tolist() == [2.0, 0.0]
+
+
+def test_rewards_to_go_spread_a_turn_over_the_time_it_lets_pass():
+    # Turns at times 0 (2 units, reward 4) and 2 (1 unit, reward 1): hourly 2, 2, 1, gamma = 1/2.
+    returns = returns_by_time(
+        column(4, 1), torch.tensor([[2], [1]]), torch.tensor([[0], [2]]), flags(1, 1), discount=0.5, length=4
+    )
+    assert returns[:, 0].tolist() == [2 + 0.5 * 2.5, 2 + 0.5, 1.0, 0.0]
+
+
+def test_rewards_beyond_the_length_are_left_out():
+    returns = returns_by_time(column(4), torch.tensor([[4]]), torch.tensor([[0]]), flags(1), discount=1.0, length=3)
+    assert returns[:, 0].tolist() == [3.0, 2.0, 1.0]
+
+
+def test_the_step_baseline_is_the_mean_at_the_same_time_over_episodes_of_the_instance():
+    # Rows 0, 1 share an instance, rows 2, 3 another. One turn each at time 0, row 1 takes two turns there.
+    rewards = torch.tensor([[1.0, 0.0, 10.0, 30.0], [NAN, 5.0, NAN, NAN]], dtype=torch.float64)
+    elapsed = torch.tensor([[1, 0, 1, 1], [1, 1, 1, 1]])
+    times = torch.zeros(2, 4, dtype=torch.int64)
+    valid = torch.tensor([[1, 1, 1, 1], [0, 1, 0, 0]], dtype=torch.bool)
+    advantages = step_baseline_advantages(rewards, elapsed, times, valid, discount=0.9, length=1, episodes=2)
+    assert advantages.tolist() == [[-2.0, 2.0, -10.0, 10.0], [0.0, 2.0, 0.0, 0.0]]
+
+
+def test_step_baseline_agrees_with_a_plain_loop_over_hours():
+    rng = np.random.default_rng(0)
+    length, rows, discount = 12, 6, 0.8
+    hourly = rng.random((length, rows))
+    returns = np.zeros((length + 1, rows))
+    for t in reversed(range(length)):
+        returns[t] = hourly[t] + discount * returns[t + 1]
+    expected = returns[:-1].reshape(length, 2, 3)
+    expected = (expected - expected.mean(axis=2, keepdims=True)).reshape(length, rows)
+    advantages = step_baseline_advantages(
+        torch.from_numpy(hourly),
+        torch.ones(length, rows, dtype=torch.int64),
+        torch.arange(length)[:, None].expand(length, rows),
+        torch.ones(length, rows, dtype=torch.bool),
+        discount=discount,
+        length=length,
+        episodes=3,
+    )
+    assert advantages.numpy() == pytest.approx(expected, abs=1e-12)
+
+
+def test_normalised_advantages_have_mean_zero_and_deviation_one_over_valid_turns_alone():
+    scaled = normalised(torch.tensor([[1.0, NAN], [3.0, 5.0]]), torch.tensor([[True, False], [True, True]]))
+    assert scaled[0, 1] == 0.0
+    counted = torch.stack([scaled[0, 0], scaled[1, 0], scaled[1, 1]])
+    assert counted.mean().item() == pytest.approx(0.0, abs=1e-6)
+    assert counted.std(correction=0).item() == pytest.approx(1.0, abs=1e-6)

@@ -1,0 +1,59 @@
+from __future__ import annotations
+
+import msgspec
+import pytest
+
+from marl_sched.envs.airme.views import FullView, LocalView
+from marl_sched.errors import InvalidOptionError, UnknownNameError
+from marl_sched.train.config import GaeConfig, StepBaselineConfig, config_from, load_config
+
+
+def test_defaults_are_the_recipe_of_the_full_view():
+    config = load_config([])
+    assert config.make_view() == FullView()
+    assert isinstance(config.algorithm, GaeConfig)
+    assert (config.policy.width, config.policy.heads, config.policy.layers) == (8, 4, 3)
+
+
+def test_groups_and_overrides_reach_their_fields():
+    config = load_config(["view=local", "view.reach=2", "policy=published", "algorithm=step_baseline", "seed=5"])
+    assert config.make_view() == LocalView(reach=2, comm=1, staleness=0)
+    assert config.policy.width == 32
+    assert isinstance(config.algorithm, StepBaselineConfig)
+    assert config.algorithm.episodes == 8
+    assert config.seed == 5
+
+
+def test_published_curriculum_is_the_dissertations():
+    curriculum = load_config(["curriculum=growing"]).curriculum
+    assert (curriculum.start, curriculum.step, curriculum.stop, curriculum.spread) == (50, 0.8, 200, 30)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("rounds=3", "rounds"),
+        ("+rounds=3", "unknown field `rounds`"),
+        ("+algorithm.lambda=1", "unknown field `lambda` - at `$.algorithm`"),
+        ("+view.reach=1", "view.reach: the view 'full' has no such option"),
+        ("algorithm.ppo.epochs=0", "`int` >= 1 - at `$.algorithm.ppo.epochs`"),
+        ("seed=many", "Expected `int`, got `str` - at `$.seed`"),
+        ("view=panorama", "Available options in 'view'"),
+    ],
+)
+def test_a_bad_override_gives_one_line_that_says_where(override: str, message: str):
+    with pytest.raises(InvalidOptionError) as caught:
+        load_config([override])
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("override", ["env.scales=[tiny]", "env.objective=fame", "env.name=mars"])
+def test_unknown_names_are_refused_before_anything_runs(override: str):
+    with pytest.raises(UnknownNameError):
+        load_config([override])
+
+
+def test_a_configuration_survives_its_json():
+    config = load_config(["view=local"])
+    assert config_from(msgspec.json.decode(msgspec.json.encode(config))) == config

@@ -1,0 +1,120 @@
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.torch import load_file
+
+from marl_sched.agents.hetgat.policy import HetGATPolicy
+from marl_sched.errors import InvalidFileError, InvalidOptionError
+from marl_sched.files import read_json
+from marl_sched.train.config import load_config
+from marl_sched.train.logging import RunLog
+from marl_sched.train.parts import build
+from marl_sched.train.run import resume, train_from_overrides
+
+TINY = [
+    "view=local", "policy.width=2", "policy.heads=2", "policy.layers=2", "algorithm.ppo.minibatch=64", "updates=4",
+    "curriculum.start=10", "curriculum.stop=12", "curriculum.step=1", "save_every=2", "validation.every=2",
+    "validation.instances=2", "validation.length=20",
+]  # fmt: skip
+GAE = [*TINY, "algorithm.instances=4", "algorithm.turns=12", "algorithm.critic.width=2"]
+STEP_BASELINE = [*TINY, "algorithm=step_baseline", "algorithm.instances=2", "algorithm.episodes=2"]
+
+
+class StoppedError(Exception):
+    """Something from outside ends the run."""
+
+
+def stop_in_update(monkeypatch: pytest.MonkeyPatch, update: int) -> None:
+    original = RunLog.update
+
+    def interrupted(self: RunLog, values: dict[str, float]) -> None:
+        original(self, values)
+        if values["update"] == update:
+            raise StoppedError
+
+    monkeypatch.setattr(RunLog, "update", interrupted)
+
+
+def checkpoint(directory: Path) -> dict[str, np.ndarray]:
+    tensors = load_file(directory / read_json(directory / "checkpoint.json")["tensors"])
+    return {name: tensor.numpy() for name, tensor in tensors.items()}
+
+
+def rows(directory: Path) -> list[dict[str, str]]:
+    with (directory / "progress.csv").open(newline="") as file:
+        return [{name: value for name, value in row.items() if name != "seconds"} for row in csv.DictReader(file)]
+
+
+@pytest.mark.parametrize("overrides", [GAE, STEP_BASELINE], ids=["gae", "step_baseline"])
+def test_a_resumed_run_ends_as_one_that_never_stopped(
+    overrides: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    whole, halved = tmp_path / "whole", tmp_path / "halved"
+    train_from_overrides([*overrides, f"run_dir={whole}"], quiet=True)
+    with monkeypatch.context() as patch:
+        stop_in_update(patch, 3)
+        with pytest.raises(StoppedError):
+            train_from_overrides([*overrides, f"run_dir={halved}"], quiet=True)
+    assert read_json(halved / "checkpoint.json")["update"] == 2
+    resume(halved, quiet=True)
+    expected, found = checkpoint(whole), checkpoint(halved)
+    assert expected.keys() == found.keys()
+    for name, tensor in expected.items():
+        assert np.array_equal(tensor, found[name]), name
+    assert rows(whole) == rows(halved)
+    assert [row["update"] for row in rows(halved)] == ["1", "2", "3", "4"]
+    assert (whole / "policy.safetensors").read_bytes() == (halved / "policy.safetensors").read_bytes()
+
+
+def test_learning_changes_the_weights_and_seeds_change_the_run(tmp_path: Path):
+    runs = {}
+    for seed in (0, 1):
+        runs[seed] = checkpoint(
+            train_from_overrides([*GAE, f"seed={seed}", f"run_dir={tmp_path / str(seed)}"], quiet=True)
+        )
+    fresh = build(load_config([*GAE, "seed=0"])).ppo.policy.state_dict()
+    changed = [not np.array_equal(tensor.numpy(), runs[0][f"policy.{name}"]) for name, tensor in fresh.items()]
+    assert any(changed)
+    assert any(not np.array_equal(runs[0][name], runs[1][name]) for name in runs[0] if name.startswith("policy."))
+
+
+def test_the_best_policy_is_kept_with_a_card_that_says_how_it_was_made(tmp_path: Path):
+    directory = train_from_overrides([*GAE, f"run_dir={tmp_path / 'run'}"], quiet=True)
+    card = read_json(directory / "policy.json")
+    assert card["command"] == "marl-sched train " + " ".join(GAE)
+    assert card["view"] == {"kind": "local", "reach": 1, "comm": 1, "staleness": 0}
+    assert card["training_knowledge"] == "a critic on the full graph"
+    scores = [float(row["validation"]) for row in rows(directory) if row["validation"]]
+    assert card["scores"]["validation"]["M1"] == pytest.approx(max(scores), abs=1e-6)
+    assert HetGATPolicy.load(directory / "policy.safetensors").card is not None
+
+
+def test_a_run_is_not_written_over_another(tmp_path: Path):
+    (tmp_path / "config.json").write_text("{}")
+    with pytest.raises(InvalidOptionError, match="holds a run already"):
+        train_from_overrides([*GAE, f"run_dir={tmp_path}"], quiet=True)
+
+
+@pytest.mark.parametrize("damage", ["no checkpoint", "truncated tensors", "another network"])
+def test_a_damaged_checkpoint_is_refused_by_name(damage: str, tmp_path: Path):
+    directory = train_from_overrides([*GAE, "updates=2", f"run_dir={tmp_path / 'run'}"], quiet=True)
+    numbers = directory / "checkpoint.json"
+    tensors = directory / read_json(numbers)["tensors"]
+    if damage == "no checkpoint":
+        numbers.unlink()
+    elif damage == "truncated tensors":
+        tensors.write_bytes(tensors.read_bytes()[:-10])
+    else:
+        text = (directory / "config.json").read_text()
+        (directory / "config.json").write_text(text.replace('"layers": 2', '"layers": 3', 1))
+    with pytest.raises(InvalidFileError, match=r"checkpoint"):
+        resume(directory, quiet=True)
+
+
+def test_resuming_what_is_no_run_is_refused(tmp_path: Path):
+    with pytest.raises(InvalidFileError, match=r"config\.json"):
+        resume(tmp_path, quiet=True)
