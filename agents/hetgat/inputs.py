@@ -25,8 +25,10 @@ class GraphInputs:
         nodes: node type -> float (B, n, f), zero where masked; the state node is (B, 1, f), and decision
             nodes, whose first features are zero, have no entry.
         masks: node type -> bool (B, n), what exists and is visible.
-        edges: relation key -> bool (B, n_t, n_s), or (B, 1, n_s) where all targets have the same sources.
-        links: key of a relation given by an index and without attention -> its `Links`.
+        edges: key of a relation that sums without attention -> float (B, n_t, n_s), 1 where there is an edge,
+            or (B, 1, n_s) where all targets have the same sources.
+        gaps: key of a relation with attention -> bool, the same shapes, true where there is no edge.
+        links: name of an index array -> its `Links`, for scatter relations without attention and for gather ones.
         attributes: key of a dense relation with edge attributes -> float (B, n_t, n_s, e), zero off the edges.
     """
 
@@ -35,6 +37,7 @@ class GraphInputs:
     nodes: dict[str, Tensor] = field(default_factory=dict)
     masks: dict[str, Tensor] = field(default_factory=dict)
     edges: dict[str, Tensor] = field(default_factory=dict)
+    gaps: dict[str, Tensor] = field(default_factory=dict)
     links: dict[str, Links] = field(default_factory=dict)
     attributes: dict[str, Tensor] = field(default_factory=dict)
 
@@ -43,11 +46,11 @@ class Links(NamedTuple):
     """At most one other end for each of n nodes: the sources of a scatter, the targets of a gather relation.
 
     Attributes:
-        present: bool (B n, 1), whether there is one.
-        rows: int64 (B n,), its row in a tensor (B n_other, features); 0 where there is none.
+        absent: bool (B n, 1), true where there is none, or where either end is hidden.
+        rows: int64 (B n,), the other end's row in a tensor (B n_other, features), meaningless where absent.
     """
 
-    present: Tensor
+    absent: Tensor
     rows: Tensor
 
 
@@ -79,7 +82,7 @@ def read_graph(
         mask = observation[f"{node.name}_mask"] != 0
         graph.masks[node.name] = mask
         graph.counts[node.name] = mask.shape[1]
-        graph.nodes[node.name] = torch.where(mask[..., None], observation[node.name].to(dtype), 0.0)
+        graph.nodes[node.name] = observation[node.name].to(dtype).masked_fill(~mask[..., None], 0.0)
     graph.masks[DECISION] = graph.masks[spec.decision_of]
     graph.counts[DECISION] = graph.counts[spec.decision_of]
     for relation in relations:
@@ -90,29 +93,39 @@ def read_graph(
 def _connect(graph: GraphInputs, relation: Relation, observation: Mapping[str, Tensor], dtype: torch.dtype) -> None:
     """Add a relation's edges in the form in which its pattern is computed."""
     key, source_mask = relation.key, graph.masks[relation.source]
-    if relation.pattern == "all":
-        graph.edges[key] = source_mask[:, None]
+    if relation.pattern == "all" and relation.source != STATE:
+        _connect_densely(graph, relation, source_mask[:, None], dtype)
     elif relation.pattern == "dense":
         edges = (observation[relation.name] != 0) & source_mask[:, None]
-        graph.edges[key] = edges
+        _connect_densely(graph, relation, edges, dtype)
         if relation.attributes:
             attributes = observation[f"{relation.name}_attributes"].to(dtype)
-            graph.attributes[key] = torch.where(edges[..., None], attributes, 0.0)
+            graph.attributes[key] = attributes.masked_fill(~edges[..., None], 0.0)
+    elif relation.pattern == "scatter" and attends(relation):
+        index = observation[str(relation.index)]
+        slots = torch.arange(graph.counts[relation.target], device=index.device)
+        edges = (index[:, None] == slots[:, None]) & source_mask[:, None]
+        _connect_densely(graph, relation, edges, dtype)
     elif relation.pattern == "scatter":
-        index = observation[str(relation.index)]
-        present = (index >= 0) & source_mask
-        if attends(relation):
-            slots = torch.arange(graph.counts[relation.target], device=index.device)
-            graph.edges[key] = (index[:, None] == slots[:, None]) & present[:, None]
-        else:
-            graph.links[key] = _links(index, present, graph.counts[relation.target])
+        _link(graph, str(relation.index), observation, relation.source, relation.target)
     elif relation.pattern == "gather":
-        index = observation[str(relation.index)]
-        present = (index >= 0) & graph.masks[relation.target]
-        present = present & source_mask.gather(1, torch.where(present, index, 0))
-        graph.links[key] = _links(index, present, graph.counts[relation.source])
+        _link(graph, str(relation.index), observation, relation.target, relation.source)
 
 
-def _links(index: Tensor, present: Tensor, n_other: int) -> Links:
-    first_row = torch.arange(index.shape[0], device=index.device)[:, None] * n_other
-    return Links(present.view(-1, 1), torch.where(present, index + first_row, 0).flatten())
+def _connect_densely(graph: GraphInputs, relation: Relation, edges: Tensor, dtype: torch.dtype) -> None:
+    if attends(relation):
+        graph.gaps[relation.key] = ~edges
+    else:
+        graph.edges[relation.key] = edges.to(dtype)
+
+
+def _link(graph: GraphInputs, name: str, observation: Mapping[str, Tensor], owner: str, other: str) -> None:
+    """Read the index array `name` that runs over `owner` nodes and points to `other` nodes, once for all relations."""
+    if name in graph.links:
+        return
+    index, n_other = observation[name], graph.counts[other]
+    present = (index >= 0) & graph.masks[owner]
+    first_row = torch.arange(0, graph.batch * n_other, n_other, device=index.device)[:, None]
+    rows = torch.where(present, index + first_row, 0).view(-1)
+    absent = ~(present.view(-1) & graph.masks[other].view(-1).index_select(0, rows))
+    graph.links[name] = Links(absent[:, None], rows)

@@ -12,8 +12,8 @@ Several heads compute this in parallel; they are concatenated, or averaged befor
 has its own transform W_T (the self-loop), which also serves as the target's side of the attention, as in
 equation 6.7. An empty neighbourhood gives a zero message.
 
-What is computed is the same formula in a cheaper order. All that leaves a node type is one matrix product:
-its own transform, its messages, and the two halves of the attention logits, since a . (W h) = (a W) h.
+What is computed is the same formula in a cheaper order. The attention logits of all relations that touch a
+node type are one matrix product with its features, since a . (W h) = (a W) h.
 Where targets are no more than sources (the state node, one plane per crew) features are brought together
 first and transformed at the target. Heads that are averaged with equal coefficients are averaged as weights.
 """
@@ -127,21 +127,11 @@ class HetGATLayer(nn.Module):
         bound = (6 / (parts * self.width + 1)) ** 0.5
         return nn.Parameter(torch.empty(self.heads, self.width).uniform_(-bound, bound))
 
-    def weights(self, *, joined: bool = False) -> LayerWeights:
-        """The weights as they are applied; compute them once for many forward passes with fixed parameters.
-
-        `joined` makes one product of all that leaves a node type, which is best for single decisions, where
-        each operation costs more than its arithmetic. Large batches are faster apart, as the pieces of a
-        joined product do not lie together in memory.
-        """
-        projections: list[Projection] = []
-        for node, size in self.sizes.items():
-            if size > 0:
-                pieces = self._pieces(node)
-                projections += [_join(node, pieces)] if joined and pieces else pieces
+    def weights(self) -> LayerWeights:
+        """The weights as they are applied; compute them once for many forward passes with fixed parameters."""
         relations = {relation.key: relation for relation in self.relations}
         return LayerWeights(
-            projections=tuple(projections),
+            projections=tuple(piece for node, size in self.sizes.items() if size > 0 for piece in self._pieces(node)),
             at_target={k: self._applied(self.message[k], r) for k, r in relations.items() if at_target(r)},
             edge={k: self._applied(weight, relations[k]) for k, weight in self.edge.items()},
             edge_score={k: _score(a, self.edge[k]) for k, a in self.attend_edge.items()},
@@ -199,7 +189,7 @@ class HetGATLayer(nn.Module):
         out: dict[str, Tensor] = {}
         for name in self.outputs:
             shape = (graph.batch, graph.counts[name], self.out_size)
-            total = sent[name] if name in sent else self.bias[name].repeat(shape[0] * shape[1], 1)
+            total = sent[name] if name in sent else self.bias[name].expand(shape[0] * shape[1], -1).contiguous()
             for relation in self._to_rows[name]:
                 self._add_to_rows(relation, total, step)
             for relation in self._to_grid[name]:
@@ -211,21 +201,21 @@ class HetGATLayer(nn.Module):
         """Add the messages of one relation to `total` (B n_t, out), in place: fresh memory is what costs."""
         key, graph = relation.key, step.graph
         if relation.pattern == "scatter":
-            links = graph.links[key]
-            total.index_add_(0, links.rows, torch.where(links.present, step.sent[key], 0.0))
+            links = graph.links[str(relation.index)]
+            total.index_add_(0, links.rows, step.sent[key].masked_fill(links.absent, 0.0))
             return
         if relation.pattern == "gather":
-            links = graph.links[key]
-            features = torch.where(links.present, step.flat[relation.source].index_select(0, links.rows), 0.0)
+            links = graph.links[str(relation.index)]
+            features = step.flat[relation.source].index_select(0, links.rows).masked_fill_(links.absent, 0.0)
         elif relation.pattern == "same":
             features = step.flat[relation.source]
             if not {relation.source, relation.target} <= self._twins:
-                features = torch.where(graph.masks[relation.source].flatten()[:, None], features, 0.0)
+                features = features.masked_fill(~graph.masks[relation.source].view(-1, 1), 0.0)
         elif attends(relation):
             alpha = self._coefficients(relation, step).squeeze(2)
             features = (alpha @ step.nodes[relation.source]).flatten(1)
         else:
-            features = (graph.edges[key].to(total.dtype) @ step.nodes[relation.source]).flatten(0, 1)
+            features = (graph.edges[key] @ step.nodes[relation.source]).flatten(0, 1)
         total.addmm_(features, step.weights.at_target[key].T)
 
     def _messages(self, relation: Relation, step: _Step) -> Tensor:
@@ -235,7 +225,7 @@ class HetGATLayer(nn.Module):
         if relation.source == STATE and relation.pattern == "all":
             return sent
         if not attends(relation):
-            messages = graph.edges[key].to(sent.dtype) @ sent
+            messages = graph.edges[key] @ sent
             return messages + functional.linear(graph.attributes[key].sum(2), edge[key]) if key in edge else messages
         alpha = self._coefficients(relation, step)
         per_head = alpha @ sent.view(*sent.shape[:2], self.heads, self.width).transpose(1, 2)
@@ -255,11 +245,10 @@ class HetGATLayer(nn.Module):
         if key in self.attend_edge:
             edge_logits = functional.linear(graph.attributes[key], step.weights.edge_score[key])
             logits = logits + edge_logits.permute(0, 3, 1, 2)
-        edges = graph.edges[key][:, None]
-        logits = functional.leaky_relu(logits, _NEGATIVE_SLOPE)
+        gaps = graph.gaps[key][:, None]
         # The lowest finite number, not -inf: a target without sources must give zeros and not NaN.
-        logits = torch.where(edges, logits, torch.finfo(logits.dtype).min)
-        return logits.softmax(-1) * edges
+        logits = functional.leaky_relu(logits, _NEGATIVE_SLOPE).masked_fill(gaps, torch.finfo(logits.dtype).min)
+        return logits.softmax(-1).masked_fill(gaps, 0.0)
 
 
 class _Step(NamedTuple):
@@ -297,16 +286,6 @@ def _pieces(projection: Projection, features: Tensor) -> Iterator[tuple[str, Ten
     for name, width in zip(projection.names, projection.widths, strict=True):
         yield name, product.narrow(-1, start, width)
         start += width
-
-
-def _join(node: str, pieces: list[Projection]) -> Projection:
-    """Several products with the same node type's features as one; a bias can only be the first piece's."""
-    names = tuple(name for piece in pieces for name in piece.names)
-    widths = tuple(width for piece in pieces for width in piece.widths)
-    bias = pieces[0].bias
-    if bias is not None:
-        bias = functional.pad(bias, (0, sum(widths) - bias.shape[0]))
-    return Projection(node, names, widths, torch.cat([piece.weight for piece in pieces]), bias)
 
 
 def _score(vector: Tensor, weight: Tensor) -> Tensor:

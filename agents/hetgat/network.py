@@ -45,9 +45,9 @@ class HetGATEncoder(nn.Module):
         self.layers = nn.ModuleList(stack)
         self._relations = {relation.key: relation for layer in stack for relation in layer.relations}
 
-    def weights(self, *, joined: bool = False) -> EncoderWeights:
+    def weights(self) -> EncoderWeights:
         """All layers' weights as they are applied (`HetGATLayer.weights`), for passes with fixed parameters."""
-        return tuple(layer.weights(joined=joined) for layer in self.layers)
+        return tuple(layer.weights() for layer in self.layers)
 
     def forward(
         self, observation: Mapping[str, Tensor], weights: EncoderWeights | None = None
@@ -79,9 +79,9 @@ class HetGATNetwork(nn.Module):
         nn.init.normal_(self.readout.weight, std=0.01)
         nn.init.zeros_(self.readout.bias)
 
-    def weights(self, *, joined: bool = False) -> EncoderWeights:
+    def weights(self) -> EncoderWeights:
         """All layers' weights as they are applied (`HetGATLayer.weights`), for passes with fixed parameters."""
-        return self.encoder.weights(joined=joined)
+        return self.encoder.weights()
 
     def forward(self, observation: Mapping[str, Tensor], weights: EncoderWeights | None = None) -> Tensor:
         """Logits (B, n_targets) from the tensors of an observation (marl_sched.graph, with batch axis).

@@ -47,7 +47,7 @@ class HetGATPolicy(ObservationScheduler):
         self.graph: GraphSpec = network.spec
         self._network = copy.deepcopy(network).requires_grad_(False)
         with torch.inference_mode():
-            self._single, self._batched = self._network.weights(joined=True), self._network.weights()
+            self._weights = self._network.weights()
         sizes = {node.name: 1 for node in self.graph.nodes}
         self._arrays = [array for array in self.graph.arrays(sizes) if array not in (TIME, VISIBLE_SHARE)]
         self._n_features = {node.name: len(node.features) for node in self.graph.nodes}
@@ -94,8 +94,7 @@ class HetGATPolicy(ObservationScheduler):
                     f"observation: {name}: policy {self.name} expects {n_features} features, got shape {shape}"
                 )
         tensors = {name: _tensor(observation[name]) for name in self._arrays}
-        weights = self._single if len(observation[STATE]) == 1 else self._batched
-        return self._network(tensors, weights).numpy()
+        return self._network(tensors, self._weights).numpy()
 
 
 def inverse_distribution(logits: np.ndarray, uniform: np.ndarray) -> np.ndarray:

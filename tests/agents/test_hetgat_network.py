@@ -144,10 +144,9 @@ def test_the_same_weights_run_on_small_and_large(graph, sizes, observe):
         assert critic(observation).shape == (3,)
 
 
-def test_joined_products_give_the_same_logits(graph, sizes, observe):
-    network, observation = network_for(graph).double(), observe(graph, sizes)
-    joined = network(observation, network.weights(joined=True))
-    torch.testing.assert_close(joined, network(observation), rtol=1e-12, atol=1e-12)
+def test_weights_computed_beforehand_give_the_same_logits(graph, sizes, observe):
+    network, observation = network_for(graph), observe(graph, sizes)
+    assert torch.equal(network(observation, network.weights()), network(observation))
 
 
 def test_an_empty_graph_gives_finite_logits_and_target_zero_alone(graph, sizes, observe):
