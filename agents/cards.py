@@ -60,7 +60,7 @@ class PolicyCard(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     scores: dict[str, Any]
     training_knowledge: str = ""
     weights_sha256: str = ""
-    schema: Literal[1] = SCHEMA
+    schema: Literal[1] = 1
 
 
 def write_card(path: str | Path, card: PolicyCard) -> None:

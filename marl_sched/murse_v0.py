@@ -21,7 +21,7 @@ waits. All agents share one reward. The same tasks come back in every round.
 |---|---|---|---|---|
 | `small`, `medium`, `large` | 9-11, 18-22, 36-44 | 3-5, at least one robot and one human | 10 | section 5.7.1 |
 | `robots-small`, `-medium`, `-large` | 16-20, 40-50, 80-100 | 2-5 robots, 5 locations | 1 | section 3.5 |
-| `homogeneous-R-*`, `heterogeneous-R-*` | the same, R = 10 also `xlarge` 160-200 | R = 2, 5, 10 robots | 1 | 4.4.1, 4.5.1 |
+| `homogeneous-R-*`, `heterogeneous-R-*` | the same, `xlarge` 160-200 for R = 10 | R = 2, 5, 10 | 1 | 4.4.1, 4.5.1 |
 | `weighted-5-small`, `-medium` | 16-20, 40-50 | 5 robots, task costs | 1 | section 4.4.4 |
 
 ### Turns

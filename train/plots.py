@@ -48,7 +48,9 @@ def score_bars(*tables: Mapping[str, Any]) -> Figure:
     axes.plot(means, y, "D", color=_INK, ms=4, mec="white", mew=0.6)
     right = max(0.0, high.max(), means.max())
     for position, bound, mean in zip(y, high, means, strict=True):
-        axes.text(max(bound, mean, 0.0) + 0.015 * right, position, f"{mean:.3f}", va="center", fontsize=9, color=_INK)
+        axes.text(
+            max(bound, mean, 0.0) + 0.015 * right, float(position), f"{mean:.3f}", va="center", fontsize=9, color=_INK
+        )
     axes.set_yticks(y, [name for name, _, _ in rows])
     axes.set_xlim(min(0.0, 1.05 * low.min()), 1.12 * right or 1.0)
     axes.set_xlabel(f"M1: mean {tables[0]['objective']} over {tables[0]['hours']} hours")
@@ -96,7 +98,7 @@ def timelines(
     if title:
         figure.suptitle(title, fontsize=11, x=0.01, ha="left")
     if legend is not None:
-        patches = [Patch(color=np.divide(colour, 255), label=label) for label, colour in legend.items()]
+        patches = [Patch(color="#{:02x}{:02x}{:02x}".format(*colour), label=label) for label, colour in legend.items()]
         figure.legend(handles=patches, loc="outside lower right", ncols=len(patches), frameon=False, fontsize=9)
     return figure
 

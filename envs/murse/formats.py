@@ -227,7 +227,8 @@ def read_flexible_job_shop(path: str | Path) -> MurseInstance:
     """
 
     def operations(line: _Line, n_machines: int) -> list[dict[int, int]]:
-        values, found, at = line.integers("operations with their machines and durations"), [], 1
+        values, at = line.integers("operations with their machines and durations"), 1
+        found: list[dict[int, int]] = []
         for _ in range(values[0]):
             count = values[at] if at < len(values) else 0
             pairs = values[at + 1 : at + 1 + 2 * count]
@@ -250,7 +251,8 @@ def _read_shop(
     n_jobs, n_machines = (int(v) for v in header.numbers("jobs machines")[:2])
     if len(lines) != n_jobs + 1:
         raise lines[-1].fail(f"{n_jobs} lines of jobs", len(lines) - 1)
-    durations, waits = [], []
+    durations: list[list[int]] = []
+    waits: list[tuple[int, int, int]] = []
     for line in lines[1:]:
         for place, machines in enumerate(operations(line, n_machines)):
             row = [0] * n_machines

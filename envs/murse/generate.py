@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -66,7 +66,11 @@ def _scales() -> dict[str, Scale]:
         scales[f"robots-{size}"] = Scale(tasks=_ROBOT_TASKS[size], agents=(2, 5), deadline_per_task=3, map_size=5)
     for robots, per_task, side in ((2, 5, 2), (5, 2, 3), (10, 1, 5)):
         for size in ("small", "medium", "large", *(("xlarge",) if robots == 10 else ())):
-            common = {"tasks": _ROBOT_TASKS[size], "agents": (robots, robots), "deadline_per_task": per_task}
+            common: dict[str, Any] = {
+                "tasks": _ROBOT_TASKS[size],
+                "agents": (robots, robots),
+                "deadline_per_task": per_task,
+            }
             scales[f"homogeneous-{robots}-{size}"] = Scale(**common, map_size=robots)
             scales[f"heterogeneous-{robots}-{size}"] = Scale(**common, team="gap", map_size=side, proximity="distance")
             if robots == 5 and size != "large":

@@ -55,7 +55,7 @@ class MurseInstance:
     def __post_init__(self) -> None:
         """Bring the arrays to their dtypes, make them read-only, and check them."""
         for name, dtype in _ARRAYS.items():
-            array = np.array(getattr(self, name), dtype)
+            array: np.ndarray = np.array(getattr(self, name), dtype)
             if name == "waits":
                 array = np.array(sorted(array.tolist()), dtype).reshape(-1, 3) if array.shape[1:] == (3,) else array
                 array = array.reshape(0, 3) if array.size == 0 else array
@@ -221,7 +221,7 @@ class MurseInstance:
     def _fastest_durations(self) -> np.ndarray:
         """Int64 (N, A), the least duration of each pair in any round."""
         if self.durations == "stochastic":
-            noisy = self.curves[:, :, [1, 3, 5]].any(axis=2)
+            noisy = np.any(self.curves[:, :, [1, 3, 5]], axis=2)
         else:
             noisy = np.zeros(self.curves.shape[:2], bool)
         humans = np.empty(self.curves.shape[:2], np.int64)

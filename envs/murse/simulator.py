@@ -200,7 +200,7 @@ class MurseSimulator(TurnSimulator):
 
     def _observe(self, agents: np.ndarray, limits: tuple[float, float], out: Observation | None) -> Observation:
         out = self.new_observation() if out is None else out
-        reverse = dict(zip(("aug", "aug_attributes"), self._no_reverse, strict=True))
+        reverse: Observation = dict(zip(("aug", "aug_attributes"), self._no_reverse, strict=True))
         arrays = graph.Arrays(*[out[name] if name in out else reverse[name] for name in graph.Arrays._fields])
         graph.observe(self.state, self.rules, np.asarray(agents, np.int64), *limits, arrays)
         return out

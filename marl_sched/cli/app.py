@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -24,7 +24,7 @@ for group in (problems, evaluation, training, deployment, demo, information):
 
 # Newer typer ships click inside itself, older ones depend on it: the base of all its errors of usage is reached
 # through the one that both export.
-_UsageError = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
+_UsageError: Any = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
 
 # The optional dependencies by the module that is missing without them.
 EXTRAS = {
@@ -65,10 +65,10 @@ def run(arguments: Sequence[str] | None = None) -> int:
     except MarlSchedError as error:
         return _refuse(str(error))
     except ModuleNotFoundError as error:
-        extra = EXTRAS.get((error.name or "").partition(".")[0])
-        if extra is None:
+        module = (error.name or "").partition(".")[0]
+        if module not in EXTRAS:
             raise
-        return _refuse(f"this needs {error.name}, which is not installed: pip install 'marl-sched[{extra}]'")
+        return _refuse(f"this needs {module}, which is not installed: pip install 'marl-sched[{EXTRAS[module]}]'")
     except OSError as error:
         if error.filename is None:
             raise

@@ -48,10 +48,13 @@ def demo(
     print_report(report)
     episodes = _same_month(domain, policy, view)
     replay, *_ = episodes.values()
+    assert domain.telemetry is not None  # or the domain could not have been deployed
     equal = report[OBJECTIVE] == domain.telemetry.series(replay)[OBJECTIVE]
     typer.echo(f"The same month played in one process is {'the same to the last bit' if equal else 'another one'}.")
 
-    typer.echo(f"\n2. {INSTANCES} other fleets x {EPISODES} months: crews that see their surroundings, and central schedulers")
+    typer.echo(
+        f"\n2. {INSTANCES} other fleets x {EPISODES} months: crews that see their surroundings, and central schedulers"
+    )
     local = _compare(domain, [policy, "condition", "preventive-first"], view)
     full = _compare(domain, [*RULES, *_central_policies()], domain.views["full"]())
     print_scores(local)
