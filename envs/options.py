@@ -40,8 +40,8 @@ def as_instance(domain: Domain, instance: Any) -> Any:
     if isinstance(instance, str | Path):
         return domain.load(Path(instance))
     if not isinstance(instance, domain.instance_type):
-        expected = f"a {domain.instance_type.__name__} or the path of its file"
-        raise InvalidOptionError(f"instance: expected {expected}, got {type(instance).__name__}")
+        expected = domain.instance_type.__name__
+        raise InvalidOptionError(f"instance: expected {expected} or a file's path, got {type(instance).__name__}")
     return instance
 
 

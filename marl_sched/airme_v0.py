@@ -82,6 +82,12 @@ for agent in env.agent_iter():
     env.step(None if over else env.action_space(agent).sample(observation["action_mask"]))
 ```
 
+### Other faces
+`gymnasium.make("marl_sched/AirME-v0", scheme="full")` is the dissertation's centralised interface: a step is an hour,
+an action a plane for each crew, the view full. Under the scheme `"skip"` the first 0 ends the hour's decisions, under
+`"single"` the first decision does. `marl_sched.envs.torchrl_env.SchedulingTorchRL("airme", batch_size=1024)` takes one
+turn in each of many instances per step, for training; it knows the schemes too.
+
 ### Version history
 * v0: the simulator of the dissertation, chapter 6, with turns instead of a central list of decisions.
 

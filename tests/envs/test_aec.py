@@ -287,7 +287,7 @@ def test_unknown_options_raise(make_env):
         make_env(scale="smal")
     with pytest.raises(UnknownNameError, match="render mode"):
         make_env(render_mode="human")
-    with pytest.raises(InvalidOptionError, match="instance: expected a AirmeInstance"):
+    with pytest.raises(InvalidOptionError, match="instance: expected AirmeInstance or a file's path, got int"):
         make_env(instance=3)
     with pytest.raises(InvalidOptionError, match="seed"):
         make_env(seed=-1)
