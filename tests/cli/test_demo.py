@@ -1,0 +1,35 @@
+"""The demonstration, with a rule in the place of the shipped policy where that saves time."""
+
+import json
+
+import pytest
+
+from marl_sched.cli import demo
+from marl_sched.domain import get_domain
+
+
+def test_the_demo_has_seven_crews():
+    assert get_domain(demo.ENV).instances(demo.SCALE, 1, demo.SEED)[0].n_crews == 7
+
+
+def test_a_rule_plays_the_demo_with_the_local_view_as_it_comes():
+    domain = get_domain(demo.ENV)
+    assert demo._view_of(domain, "condition") == domain.views["local"]()
+
+
+@pytest.mark.slow
+def test_the_demo_deploys_compares_and_draws(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(demo, "INSTANCES", 2)
+    monkeypatch.setattr(demo, "HOURS", 48)
+    ended = run("demo", "--policy", "preventive-first", "--out", tmp_path)
+    assert ended.code == 0
+    assert "the same to the last bit" in ended.out
+    names = ["deployment.json", "results-full-view.json", "results-local-view.json", "scores.png", "timelines.png"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == names
+    deployed = json.loads((tmp_path / "deployment.json").read_text())
+    assert len(deployed["agents"]) == 7
+    assert deployed["hours"] == len(deployed["profit"]) == 48
+    assert deployed["deaths"] == []
+    assert deployed["view"]["visible_share"] <= 0.45
+    local = json.loads((tmp_path / "results-local-view.json").read_text())
+    assert list(local["schedulers"]) == ["preventive-first", "condition"]
