@@ -184,7 +184,7 @@ class HetGATLayer(nn.Module):
         flat = {name: features.flatten(0, 1) for name, features in nodes.items()}
         sent: dict[str, Tensor] = {}
         for projection in weights.projections:
-            sent.update(_pieces(projection, flat[projection.node]))
+            sent.update(_project(projection, flat[projection.node]))
         step = _Step(graph, nodes, flat, sent, weights)
         out: dict[str, Tensor] = {}
         for name in self.outputs:
@@ -276,7 +276,7 @@ def _to_rows(relation: Relation) -> bool:
     return at_target(relation) or (relation.pattern == "scatter" and not attends(relation))
 
 
-def _pieces(projection: Projection, features: Tensor) -> Iterator[tuple[str, Tensor]]:
+def _project(projection: Projection, features: Tensor) -> Iterator[tuple[str, Tensor]]:
     """A projection of features (B n, in) and the names of its pieces, each of which may be changed in place."""
     product = functional.linear(features, projection.weight, projection.bias)
     if len(projection.names) == 1:

@@ -5,13 +5,14 @@ No weight depends on the graph's size: the same network runs on any number of pl
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
+from typing import cast
 
 import torch
 from torch import Tensor, nn
 
 from marl_sched.agents.hetgat.inputs import GraphInputs, read_graph
-from marl_sched.agents.hetgat.layer import HetGATLayer, LayerWeights
+from marl_sched.agents.hetgat.layer import HetGATLayer, LayerWeights, Merge
 from marl_sched.graph import ACTION_MASK, DECISION, STATE, GraphSpec
 
 EncoderWeights = tuple[LayerWeights, ...]
@@ -36,9 +37,9 @@ class HetGATEncoder(nn.Module):
         self.spec = spec
         sizes = {node.name: len(node.features) for node in spec.nodes}
         sizes |= {STATE: len(spec.state_features), DECISION: 0}
-        stack = []
+        stack: list[HetGATLayer] = []
         for wanted in _needed(spec, outputs, layers):
-            merge = "mean" if len(stack) == layers - 1 else "concat"
+            merge: Merge = "mean" if len(stack) == layers - 1 else "concat"
             layer = HetGATLayer(spec, sizes, width=width, heads=heads, merge=merge, outputs=wanted)
             sizes = {name: layer.out_size if name in wanted else 0 for name in sizes}
             stack.append(layer)
@@ -47,14 +48,13 @@ class HetGATEncoder(nn.Module):
 
     def weights(self) -> EncoderWeights:
         """All layers' weights as they are applied (`HetGATLayer.weights`), for passes with fixed parameters."""
-        return tuple(layer.weights() for layer in self.layers)
+        return tuple(layer.weights() for layer in cast(Iterable[HetGATLayer], self.layers))
 
     def forward(
         self, observation: Mapping[str, Tensor], weights: EncoderWeights | None = None
     ) -> tuple[dict[str, Tensor], GraphInputs]:
         """Features (B, n, width) of the output node types, (B, 1, width) for the state, and the graph read."""
-        dtype = self.layers[0].bias[next(iter(self.layers[0].bias))].dtype
-        graph = read_graph(self.spec, observation, self._relations.values(), dtype)
+        graph = read_graph(self.spec, observation, self._relations.values(), next(self.parameters()).dtype)
         nodes = graph.nodes
         for layer, applied in zip(self.layers, weights or self.weights(), strict=True):
             nodes = layer(graph, nodes, applied)
@@ -113,11 +113,11 @@ class HetGATCritic(nn.Module):
         self.encoder = HetGATEncoder(spec, width=width, heads=heads, layers=layers, outputs=[*names, STATE])
         self.node_terms = nn.ModuleDict({name: nn.Linear(width, 1) for name in names})
         hidden = width * heads
-        self.state_term = nn.Sequential(nn.Linear(width + extra, hidden), nn.ReLU(), nn.Linear(hidden, 1))
+        last = nn.Linear(hidden, 1)
+        self.state_term = nn.Sequential(nn.Linear(width + extra, hidden), nn.ReLU(), last)
         # The sum over a fleet of random terms would start far from any return.
-        for last in (*self.node_terms.values(), self.state_term[-1]):
-            nn.init.zeros_(last.weight)
-            nn.init.zeros_(last.bias)
+        for parameter in (*self.node_terms.parameters(), *last.parameters()):
+            nn.init.zeros_(parameter)
 
     def forward(self, observation: Mapping[str, Tensor], extra: Tensor | None = None) -> Tensor:
         """Values (B,) from an observation's tensors and, if the critic has them, `extra` inputs (B, n_extra)."""

@@ -88,7 +88,7 @@ class HetGATPolicy(ObservationScheduler):
         Raises InvalidOptionError for an observation without the arrays or the features that it was trained on.
         """
         for name, n_features in self._n_features.items():
-            shape = np.shape(observation.get(name))
+            shape = np.shape(observation[name]) if name in observation else ()
             if not shape or shape[-1] != n_features:
                 raise InvalidOptionError(
                     f"observation: {name}: policy {self.name} expects {n_features} features, got shape {shape}"
