@@ -115,9 +115,7 @@ def test_objectives_are_means_over_the_hours_played() -> None:
 
 @pytest.mark.parametrize(("objective", "expected"), [("profit", 0), ("revenue", 1), ("availability", 2)])
 def test_reward_is_the_hours_objective(objective: str, expected: int) -> None:
-    simulator = AirmeSimulator(
-        [fleet((STEADY, 15.0, 0, 0, False), (RESERVE, 5.0, 0, 0, True))], objective=objective
-    )
+    simulator = AirmeSimulator([fleet((STEADY, 15.0, 0, 0, False), (RESERVE, 5.0, 0, 0, True))], objective=objective)
     play(simulator, [2])
     assert simulator.reward[0] == simulator.state.series[0, 0, expected]
     assert len(set(simulator.state.series[0, 0])) == 3

@@ -70,9 +70,7 @@ def test_condition_serves_broken_planes_by_income_then_worn_ones_from_40_hours_b
 
 
 def test_periodic_acts_only_in_every_sixth_hour_and_then_on_all_planes() -> None:
-    instance = fleet_of(
-        (FIXED, 1.0, 4, 0, False), (FIXED, 19.0, 39, 20, False), (HELI, 2.0, 0, 0, True), n_crews=3
-    )
+    instance = fleet_of((FIXED, 1.0, 4, 0, False), (FIXED, 19.0, 39, 20, False), (HELI, 2.0, 0, 0, True), n_crews=3)
     assert order(PeriodicRule(), instance) == [3, 2, 1]
     simulator = AirmeSimulator([generate("small", np.random.default_rng(0))], horizon=30)
     hours = set()
@@ -156,11 +154,7 @@ QUEUES: dict[str, Key] = {
         (0, -income) if broken else (1, -risk(kind, hours, landings)) if risk(kind, hours, landings) >= 0.004 else None
     ),
     "preventive-first": lambda kind, income, hours, landings, broken: (
-        (1, -income)
-        if broken
-        else (0, -hours * income)
-        if (landings >= 4 if kind == HELI else hours >= 45)
-        else None
+        (1, -income) if broken else (0, -hours * income) if (landings >= 4 if kind == HELI else hours >= 45) else None
     ),
 }
 

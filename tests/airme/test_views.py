@@ -104,9 +104,7 @@ def observed(simulator: AirmeSimulator) -> dict[str, np.ndarray]:
     return simulator.observe(simulator.acting)
 
 
-views = st.builds(
-    LocalView, reach=st.integers(0, 2), comm=st.integers(0, 2), staleness=st.sampled_from([0, 1, 3, 12])
-)
+views = st.builds(LocalView, reach=st.integers(0, 2), comm=st.integers(0, 2), staleness=st.sampled_from([0, 1, 3, 12]))
 
 
 @settings(deadline=None, max_examples=80)
