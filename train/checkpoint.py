@@ -6,10 +6,12 @@ The JSON is written last and replaces the old one, so that at any moment there i
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
+import msgspec
 import numpy as np
 import torch
 from safetensors import SafetensorError
@@ -21,45 +23,81 @@ from marl_sched.files import read_json, replacing, write_json
 from marl_sched.train.ppo import Ppo
 
 NAME = "checkpoint.json"
-SCHEMA = 1
+_COLLECTOR = "collector."
 
 
-def save_checkpoint(directory: Path, numbers: Mapping[str, Any], ppo: Ppo, collector: Mapping[str, np.ndarray]) -> None:
-    """Write networks, optimizer and collector, and `numbers`, which JSON must be able to hold."""
-    tensors = {f"collector.{name}": torch.from_numpy(np.atleast_1d(array)) for name, array in collector.items()}
+@dataclass
+class Counters:
+    """How far a run has come.
+
+    Attributes:
+        update: updates done.
+        seconds: wall time of all updates.
+        hours: simulated time over all rows.
+        decisions: turns taken.
+        best: the best validation score so far, None before the first.
+    """
+
+    update: int = 0
+    seconds: float = 0.0
+    hours: int = 0
+    decisions: int = 0
+    best: float | None = None
+
+
+class Numbers(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What `checkpoint.json` holds; `tensors` is the name of the other file, `estimator` the estimator's state."""
+
+    tensors: str
+    counters: Counters
+    estimator: dict[str, float | None]
+    schema: Literal[1] = 1
+
+
+def save_checkpoint(
+    directory: Path,
+    counters: Counters,
+    ppo: Ppo,
+    estimator: dict[str, float | None],
+    collector: Mapping[str, np.ndarray],
+) -> None:
+    """Write networks, optimizer, the states of estimator and collector, and the counters."""
+    tensors = {f"{_COLLECTOR}{name}": torch.from_numpy(array) for name, array in collector.items()}
     tensors |= _learned(ppo)
-    name = f"checkpoint-{numbers['update']:06d}.safetensors"
+    name = f"checkpoint-{counters.update:06d}.safetensors"
     with replacing(directory / name) as temporary:
         save_file({key: tensor.contiguous() for key, tensor in tensors.items()}, temporary)
-    write_json(directory / NAME, {"schema": SCHEMA, "tensors": name, **numbers})
+    numbers = Numbers(tensors=name, counters=counters, estimator=estimator)
+    write_json(directory / NAME, msgspec.to_builtins(numbers))
     for old in directory.glob("checkpoint-*.safetensors"):
         if old.name != name:
             old.unlink()
 
 
-def load_checkpoint(directory: Path, ppo: Ppo) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Put networks and optimizer back; the numbers and the collector's state that were saved with them.
+def load_checkpoint(directory: Path, ppo: Ppo, expected: Collection[str]) -> tuple[Numbers, dict[str, np.ndarray]]:
+    """Put networks and optimizer back; the numbers and the collector's state, with the `expected` names.
 
     Raises InvalidFileError for a file that is missing, damaged or of another network.
     """
-    numbers = read_json(directory / NAME)
-    if not isinstance(numbers, dict) or numbers.get("schema") != SCHEMA:
-        raise InvalidFileError(directory / NAME, "schema", str(SCHEMA))
-    path = directory / str(numbers.get("tensors"))
+    try:
+        numbers = msgspec.convert(read_json(directory / NAME), Numbers)
+    except msgspec.ValidationError as error:
+        raise InvalidFileError(directory / NAME, "", f"a training checkpoint: {error}") from error
+    path = directory / numbers.tensors
     try:
         saved = load_file(path)
     except (OSError, SafetensorError) as error:
         raise InvalidFileError(path, "", f"a readable safetensors file ({error})") from error
-    collector = {
-        name.removeprefix("collector."): t.numpy() for name, t in saved.items() if name.startswith("collector.")
-    }
+    for name in expected:
+        if _COLLECTOR + name not in saved:
+            raise InvalidFileError(path, _COLLECTOR + name, "a tensor of that name")
     _prepare(ppo)
     with torch.no_grad():
         for name, tensor in _learned(ppo).items():
             if name not in saved or saved[name].shape != tensor.shape:
                 raise InvalidFileError(path, name, f"a tensor of shape {tuple(tensor.shape)}")
             tensor.copy_(saved[name])
-    return numbers, collector
+    return numbers, {name: saved[_COLLECTOR + name].numpy() for name in expected}
 
 
 def _learned(ppo: Ppo) -> dict[str, Tensor]:

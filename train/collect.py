@@ -63,7 +63,17 @@ class Rollout:
     def reward_rate(self) -> float:
         """Reward per unit of simulated time over all valid turns: M1 of the sampling policy."""
         valid = self.valid[:-1]
-        return float(self.rewards[valid].sum() / self.elapsed[valid].sum().clamp(min=1))
+        return float(self.rewards[valid].sum() / max(self.time, 1))
+
+    @property
+    def time(self) -> int:
+        """Simulated time that passed in valid turns, over all rows."""
+        return int(self.elapsed[self.valid[:-1]].sum())
+
+    @property
+    def decisions(self) -> int:
+        """Number of valid turns."""
+        return int(self.valid[:-1].sum())
 
 
 class InstanceSource:

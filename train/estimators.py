@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import torch
 from torch import Tensor, nn
@@ -29,10 +29,10 @@ class Estimator(Protocol):
     def estimate(self, rollout: Rollout) -> Estimate:
         """Advantages of a rollout's turns, zero where a turn is not valid."""
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> dict[str, float | None]:
         """What a resumed run needs, as JSON."""
 
-    def restore(self, state: dict[str, Any]) -> None:
+    def restore(self, state: dict[str, float | None]) -> None:
         """Go on from a saved state."""
 
 
@@ -80,11 +80,11 @@ class CriticEstimator:
             values.append(self._critic(part).unflatten(0, (-1, rollout.times.shape[1])))
         return torch.cat(values)
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> dict[str, float | None]:
         """The reward rate."""
         return {"reward_rate": self._rate}
 
-    def restore(self, state: dict[str, Any]) -> None:
+    def restore(self, state: dict[str, float | None]) -> None:
         """The reward rate."""
         self._rate = state["reward_rate"]
 
@@ -108,9 +108,9 @@ class StepBaseline:
         )
         return Estimate(advantages, None, 0.0)
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> dict[str, float | None]:
         """Nothing."""
         return {}
 
-    def restore(self, state: dict[str, Any]) -> None:
+    def restore(self, state: dict[str, float | None]) -> None:
         """Nothing."""

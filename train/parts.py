@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
@@ -13,32 +13,14 @@ from marl_sched.agents.hetgat.network import HetGATCritic, HetGATNetwork
 from marl_sched.domain import get_domain
 from marl_sched.envs.torchrl_env import SchedulingTorchRL
 from marl_sched.graph import GraphSpec
-from marl_sched.train.checkpoint import load_checkpoint, save_checkpoint
-from marl_sched.train.collect import Collector, EpisodeCollector, InstanceSource, Rollout, SegmentCollector
+from marl_sched.train.checkpoint import Counters, load_checkpoint, save_checkpoint
+from marl_sched.train.collect import Collector, EpisodeCollector, InstanceSource, SegmentCollector
 from marl_sched.train.config import GaeConfig, StepBaselineConfig, TrainConfig
 from marl_sched.train.curriculum import EpisodeLength
 from marl_sched.train.estimators import CriticEstimator, Estimator, StepBaseline
 from marl_sched.train.export import save_best
 from marl_sched.train.ppo import Ppo
 from marl_sched.train.validation import Validation
-
-
-@dataclass
-class Counters:
-    """How far a run has come; `best` is the best validation score so far, None before the first."""
-
-    update: int = 0
-    seconds: float = 0.0
-    hours: int = 0
-    decisions: int = 0
-    best: float | None = None
-
-    def add(self, rollout: Rollout) -> None:
-        """Count an update's experience: simulated time over all rows, and decisions."""
-        valid = rollout.valid[:-1]
-        self.update += 1
-        self.hours += int(rollout.elapsed[valid].sum())
-        self.decisions += int(valid.sum())
 
 
 @dataclass(frozen=True)
@@ -71,15 +53,14 @@ class Parts:
         """Write a checkpoint if it is time to."""
         if counters.update % self.config.save_every and counters.update != self.config.updates:
             return
-        numbers = {"counters": asdict(counters), "update": counters.update, "estimator": self.estimator.state()}
-        save_checkpoint(directory, numbers, self.ppo, self.collector.state())
+        save_checkpoint(directory, counters, self.ppo, self.estimator.state(), self.collector.state())
 
     def restore(self, directory: Path) -> Counters:
         """Put everything back as the last checkpoint has it."""
-        numbers, collector = load_checkpoint(directory, self.ppo)
-        self.estimator.restore(numbers["estimator"])
+        numbers, collector = load_checkpoint(directory, self.ppo, list(self.collector.state()))
+        self.estimator.restore(numbers.estimator)
         self.collector.restore(collector)
-        return Counters(**numbers["counters"])
+        return numbers.counters
 
 
 def build(config: TrainConfig) -> Parts:

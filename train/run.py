@@ -13,10 +13,13 @@ import torch
 
 from marl_sched.errors import InvalidFileError, InvalidOptionError
 from marl_sched.files import read_json, write_json
+from marl_sched.train.checkpoint import Counters
+from marl_sched.train.collect import Rollout
 from marl_sched.train.config import TrainConfig, config_from, load_config
+from marl_sched.train.estimators import Estimate
 from marl_sched.train.logging import RunLog
-from marl_sched.train.parts import Counters, build
-from marl_sched.train.ppo import Sampler, samples_of
+from marl_sched.train.parts import build
+from marl_sched.train.ppo import Sampler, UpdateReport, samples_of
 
 CONFIG = "config.json"
 _SAMPLES = 2  # last word of the seeds that pick and order samples
@@ -60,18 +63,24 @@ def train(
             rng = np.random.default_rng([config.seed, update, _SAMPLES])
             samples = samples_of(parts.graph, rollout, estimate, config.algorithm.ppo.keep_least, rng)
             report = parts.ppo.update(samples, update / config.updates, rng)
-            counters.add(rollout)
+            counters.update += 1
+            counters.hours += rollout.time
+            counters.decisions += rollout.decisions
             scores = parts.validate(counters, directory, overrides)
             counters.seconds += time.perf_counter() - started
-            log.update(
-                {
-                    "reward_rate": rollout.reward_rate,
-                    "explained_variance": estimate.explained_variance,
-                    "length": rollout.length,
-                    **asdict(report),
-                    **{name: value for name, value in asdict(counters).items() if name != "best"},
-                    **scores,
-                }
-            )
+            log.update(_row(counters, rollout, estimate, report) | scores)
             parts.save(counters, directory)
     return directory
+
+
+def _row(counters: Counters, rollout: Rollout, estimate: Estimate, report: UpdateReport) -> dict[str, float]:
+    """What is logged of an update, by the names of marl_sched.train.logging.COLUMNS."""
+    done = asdict(counters)
+    del done["best"]  # told with the validation that found it
+    return {
+        **done,
+        **asdict(report),
+        "reward_rate": rollout.reward_rate,
+        "length": rollout.length,
+        "explained_variance": estimate.explained_variance,
+    }

@@ -59,7 +59,7 @@ def test_a_resumed_run_ends_as_one_that_never_stopped(
         stop_in_update(patch, 3)
         with pytest.raises(StoppedError):
             train_from_overrides([*overrides, f"run_dir={halved}"], quiet=True)
-    assert read_json(halved / "checkpoint.json")["update"] == 2
+    assert read_json(halved / "checkpoint.json")["counters"]["update"] == 2
     resume(halved, quiet=True)
     expected, found = checkpoint(whole), checkpoint(halved)
     assert expected.keys() == found.keys()
