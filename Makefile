@@ -28,6 +28,7 @@ wheel: $(INSTALLED)
 		> "$$($(WHEEL_VENV)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/dependencies.pth"
 	$(BIN)/python -m pip --python $(WHEEL_VENV) install --quiet --no-deps --no-index build/wheel/*.whl
 	cd $(WHEEL_VENV) && bin/marl-sched --version && bin/marl-sched list
+	cd $(WHEEL_VENV) && bin/python -c "from marl_sched.train.config import load_config; load_config([])" # the YAML ships
 
 # Types are checked where the package is whole: installed. From the root mypy would see the core alone.
 lint: $(INSTALLED) ## style, formatting, types
