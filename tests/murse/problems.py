@@ -57,8 +57,8 @@ def instances(draw: st.DrawFn) -> MurseInstance:
     durations = draw(
         st.lists(st.lists(st.integers(0, 9), min_size=n_robots, max_size=n_robots), min_size=n, max_size=n)
     )
-    for row in durations:
-        row[0] = max(row[0], 1)
+    for each in durations:
+        each[0] = max(each[0], 1)
     seed = draw(st.integers(0, 2**16))
     rng = np.random.default_rng(seed)
     curves = np.zeros((n, n_humans, 6))
