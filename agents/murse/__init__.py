@@ -1,0 +1,1 @@
+"""What decides in MuRSE: exact and mathematical-programming schedulers, searches and auctions."""

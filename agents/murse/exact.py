@@ -1,0 +1,183 @@
+"""The exact scheduler: OR-Tools CP-SAT over optional intervals (the problem of equations 3.1-3.9 and 4.1).
+
+Each task has one start and, for every eligible agent, an optional interval; exactly one is taken. An agent's
+intervals do not overlap, nor do those of a pair that is near; waits and deadlines bound starts and finishes. The
+dissertation linearises the same problem for a MILP solver; intervals need no big-M constants.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from marl_sched.agents.murse.problem import Plan, Round
+from marl_sched.envs.murse.instance import NO_DEADLINE
+from marl_sched.envs.murse.timetable import longest_round
+from marl_sched.errors import InvalidOptionError, MarlSchedError, require
+
+if TYPE_CHECKING:
+    from ortools.sat.python import cp_model
+
+OBJECTIVES = ("makespan", "weighted")
+_WEIGHT_UNIT = 1000  # CP-SAT counts in integers; weights are rounded to thousandths
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Solution:
+    """What the solver found.
+
+    Attributes:
+        plan: the best schedule, None if none was found.
+        status: "optimal", "feasible", "infeasible" (proved) or "unknown" (the time was up).
+        objective: of the plan; nan without one.
+        bound: no schedule is better than this; nan if infeasible.
+        seconds: time spent.
+    """
+
+    plan: Plan | None
+    status: str
+    objective: float
+    bound: float
+    seconds: float
+
+    @property
+    def gap(self) -> float:
+        """(objective - bound) / objective, 0 for a proved optimum; nan without a plan."""
+        return (self.objective - self.bound) / self.objective if self.objective else 0.0
+
+
+def solve(problem: Round, *, objective: str = "makespan", time_limit: float = 10.0, seed: int = 0) -> Solution:
+    """Minimise the makespan or the weighted completion time within `time_limit` seconds on one thread.
+
+    A run that ends before its time limit is the same every time. Raises UnknownNameError or InvalidOptionError
+    for options outside their domain, MarlSchedError without OR-Tools.
+    """
+    require("objective of murse", objective, OBJECTIVES)
+    if not time_limit > 0:
+        raise InvalidOptionError(f"exact: time_limit: expected seconds > 0, got {time_limit}")
+    cp = _ortools()
+    model = _Model(cp, problem)
+    model.minimise(objective)
+    solver = cp.CpSolver()
+    solver.parameters.max_time_in_seconds = time_limit
+    solver.parameters.num_workers = 1
+    solver.parameters.random_seed = seed
+    status = solver.solve(model.model)
+    seconds = float(solver.wall_time)
+    if status == cp.INFEASIBLE:
+        return Solution(plan=None, status="infeasible", objective=np.nan, bound=np.nan, seconds=seconds)
+    unit = _WEIGHT_UNIT if objective == "weighted" else 1
+    bound = float(solver.best_objective_bound) / unit
+    if status not in (cp.OPTIMAL, cp.FEASIBLE):
+        return Solution(plan=None, status="unknown", objective=np.nan, bound=bound, seconds=seconds)
+    return Solution(
+        plan=model.plan(solver),
+        status="optimal" if status == cp.OPTIMAL else "feasible",
+        objective=float(solver.objective_value) / unit,
+        bound=bound,
+        seconds=seconds,
+    )
+
+
+class _Model:
+    """The constraint model of one round, and the way back from its solution to a plan."""
+
+    def __init__(self, cp: Any, problem: Round) -> None:
+        self.problem = problem
+        self.model: cp_model.CpModel = cp.CpModel()
+        release = int(max(problem.ready.max(), problem.fixed.max(), 0))
+        self.horizon = release + int(longest_round(problem.durations, problem.lags))
+        self.starts = [self._start(i) for i in range(problem.n_tasks)]
+        self.ends: list[Any] = []
+        self.taken: dict[tuple[int, int], Any] = {}
+        self._tasks()
+        self._constraints()
+
+    def _start(self, i: int) -> Any:
+        fixed = int(self.problem.fixed[i])
+        low, high = (fixed, fixed) if fixed >= 0 else (0, self.horizon)
+        return self.model.new_int_var(low, high, f"start {i + 1}")
+
+    def _tasks(self) -> None:
+        """Optional intervals of every task, one of which is taken, and no overlap of an agent's."""
+        problem, model = self.problem, self.model
+        of_agent: list[list[Any]] = [[] for _ in range(problem.n_agents)]
+        for i in range(problem.n_tasks):
+            end = model.new_int_var(0, self.horizon, f"end {i + 1}")
+            able = [int(problem.agents[i])] if problem.fixed[i] >= 0 else np.flatnonzero(problem.eligible[i]).tolist()
+            for agent in able:
+                taken = model.new_bool_var(f"{i + 1} by {agent}")
+                duration = int(problem.durations[i, agent])
+                interval = model.new_optional_interval_var(self.starts[i], duration, end, taken, f"{i + 1} at {agent}")
+                of_agent[agent].append(interval)
+                self.taken[i, agent] = taken
+                if problem.fixed[i] < 0 and problem.ready[agent] > 0:
+                    model.add(self.starts[i] >= int(problem.ready[agent])).only_enforce_if(taken)
+            model.add_exactly_one(self.taken[i, agent] for agent in able)
+            self.ends.append(end)
+        for intervals in of_agent:
+            model.add_no_overlap(intervals)
+
+    def _constraints(self) -> None:
+        """Waits, deadlines and separation in space."""
+        problem, model = self.problem, self.model
+        for i, j in np.argwhere(problem.lags >= 0):
+            model.add(self.starts[i] >= self.ends[j] + int(problem.lags[i, j]))
+        for i in np.flatnonzero(problem.deadlines != NO_DEADLINE):
+            model.add(self.ends[i] <= int(problem.deadlines[i]))
+        spans = {
+            int(i): model.new_interval_var(self.starts[i], self._length(i), self.ends[i], f"span {i + 1}")
+            for i in np.flatnonzero(problem.near.any(axis=1))
+        }
+        for i, j in np.argwhere(np.triu(problem.near)):
+            model.add_no_overlap([spans[int(i)], spans[int(j)]])
+
+    def _length(self, i: int) -> Any:
+        longest = int(self.problem.durations[i].max())
+        length = self.model.new_int_var(0, longest, f"length {i + 1}")
+        self.model.add(length == self.ends[i] - self.starts[i])
+        return length
+
+    def minimise(self, objective: str) -> None:
+        """Set what is minimised."""
+        if objective == "makespan":
+            makespan = self.model.new_int_var(0, self.horizon, "makespan")
+            self.model.add_max_equality(makespan, self.ends)
+            for agent in range(self.problem.n_agents):
+                # Implied by the intervals, but only this tells the linear relaxation how much work there is.
+                load = sum(
+                    int(self.problem.durations[i, a]) * taken for (i, a), taken in self.taken.items() if a == agent
+                )
+                self.model.add(makespan >= load)
+            self.model.minimize(makespan)
+        else:
+            costs = np.rint(self.problem.weights * _WEIGHT_UNIT).astype(np.int64)
+            self.model.minimize(sum(int(cost) * end for cost, end in zip(costs, self.ends, strict=True)))
+
+    def plan(self, solver: Any) -> Plan:
+        """The solution as an order of dispatch: by start, ties by finish, then by index."""
+        starts = np.array([solver.value(start) for start in self.starts], np.int64)
+        finishes = np.array([solver.value(end) for end in self.ends], np.int64)
+        agents = np.full(len(starts), -1, np.int64)
+        for (i, agent), taken in self.taken.items():
+            if solver.boolean_value(taken):
+                agents[i] = agent
+        tasks = np.lexsort((np.arange(len(starts)), finishes, starts))
+        return Plan(
+            tasks=tasks,
+            agents=agents[tasks],
+            starts=starts,
+            finishes=finishes,
+            makespan=int(finishes.max()),
+            feasible=True,
+        )
+
+
+def _ortools() -> Any:
+    try:
+        from ortools.sat.python import cp_model
+    except ModuleNotFoundError as error:
+        raise MarlSchedError("exact: expected OR-Tools to be installed: pip install 'marl-sched[solvers]'") from error
+    return cp_model
