@@ -128,11 +128,11 @@ class _Model:
         for i in np.flatnonzero(problem.deadlines != NO_DEADLINE):
             model.add(self.ends[i] <= int(problem.deadlines[i]))
         spans = {
-            int(i): model.new_interval_var(self.starts[i], self._length(i), self.ends[i], f"span {i + 1}")
-            for i in np.flatnonzero(problem.near.any(axis=1))
+            i: model.new_interval_var(self.starts[i], self._length(i), self.ends[i], f"span {i + 1}")
+            for i in np.flatnonzero(problem.near.any(axis=1)).tolist()
         }
-        for i, j in np.argwhere(np.triu(problem.near)):
-            model.add_no_overlap([spans[int(i)], spans[int(j)]])
+        for i, j in np.argwhere(np.triu(problem.near)).tolist():
+            model.add_no_overlap([spans[i], spans[j]])
 
     def _length(self, i: int) -> Any:
         longest = int(self.problem.durations[i].max())
