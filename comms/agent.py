@@ -24,6 +24,7 @@ from marl_sched.errors import DeploymentError, InvalidMessageError, InvalidOptio
 
 log = logging.getLogger(__name__)
 RETRY = 0.2  # seconds between two hellos, or two questions
+ANSWER = 1.0  # seconds that an answer may take
 HEARTBEAT = 1.0  # seconds after which a joined agent says hello again, and learns whether it is still counted on
 REFUSED = 5.0  # seconds for which a refusal is not final: the seat's last process may just be dying
 
@@ -76,11 +77,15 @@ class Agent:
                 self.subscriptions.add(key)
 
     def _ask_frame(self) -> wire.Frame:
+        return wire.decode(self._ask(wire.FRAME, b""), wire.Frame)
+
+    def _ask(self, key: str, payload: bytes) -> bytes:
+        """The world's answer. A question may be lost with the link that it was put to, so it is put again."""
         end = time.monotonic() + self.options.join_timeout
         while time.monotonic() < end:
-            answer = self.transport.ask(wire.FRAME, b"", RETRY * 5)
+            answer = self.transport.ask(key, payload, ANSWER)
             if answer is not None:
-                return wire.decode(answer, wire.Frame)
+                return answer
             time.sleep(RETRY)
         raise DeploymentError(
             f"no world of run {self.options.run!r} at {self.options.connect} within {self.options.join_timeout:g} s"
@@ -182,10 +187,7 @@ class Agent:
     def _catch_up(self) -> bool:
         """Ask for the newest state of all channels; True if the run is over."""
         request = wire.encode(wire.SnapshotRequest(agent=self.agent))
-        answer = self.transport.ask(wire.SNAPSHOT, request, self.options.join_timeout)
-        if answer is None:
-            raise DeploymentError(f"no snapshot from {self.options.connect} within {self.options.join_timeout:g} s")
-        snapshot = wire.decode(answer, wire.Snapshot)
+        snapshot = wire.decode(self._ask(wire.SNAPSHOT, request), wire.Snapshot)
         self.counts["snapshots"] += 1
         for channel, news in snapshot.channels.items():
             self._learn(channel, news)
