@@ -111,7 +111,7 @@ def model_based(threshold: float = _FAILURE_THRESHOLD, types: Sequence[AircraftT
     """Broken planes by income, then unbroken ones by their true failure probability of an hour flown now."""
 
     def priority(fleet: _Fleet) -> np.ndarray:
-        kind = fleet.types.argmax(axis=-1)
+        kind = (fleet.types @ np.arange(len(types))).astype(np.int64)
         hours, landings = fleet.hours.astype(np.int64), fleet.landings.astype(np.int64)
         table = _failure_table(tuple(types), int(max(hours.max(), landings.max())).bit_length())
         survival = np.ones_like(fleet.hours)
