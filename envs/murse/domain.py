@@ -27,6 +27,6 @@ MURSE = register(
         central=RoundSchedules(),
         render={"ansi": render.board, "rgb_array": render.gantt},
         default_horizon=DEFAULT_HORIZON,
-        extras={"modes": ("plan", "online")},
+        extras={"modes": ("plan", "online"), "unit": "rounds", "better": "lower"},
     )
 )

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from marl_sched.envs.murse import dynamics, graph, rules
+from marl_sched.envs.murse import dynamics, graph, observation, rules
 from marl_sched.envs.murse.generate import SCALES
 from marl_sched.envs.murse.instance import DURATIONS, PROXIMITY, MurseInstance
 from marl_sched.envs.murse.state import NOBODY, load_instance, new_state
@@ -202,7 +202,7 @@ class MurseSimulator(TurnSimulator):
         out = self.new_observation() if out is None else out
         reverse: Observation = dict(zip(("aug", "aug_attributes"), self._no_reverse, strict=True))
         arrays = graph.Arrays(*[out[name] if name in out else reverse[name] for name in graph.Arrays._fields])
-        graph.observe(self.state, self.rules, np.asarray(agents, np.int64), *limits, arrays)
+        observation.observe(self.state, self.rules, np.asarray(agents, np.int64), *limits, arrays)
         return out
 
     def free_agents(self, row: int) -> np.ndarray:
@@ -232,6 +232,22 @@ class MurseSimulator(TurnSimulator):
         }
         means = {name: np.where(ended, values, 0).sum(axis=1) / n for name, values in measures.items()}
         return means | {"conflicts": np.where(ended, rounds["conflicts"], 0).sum(axis=1).astype(np.float64)}
+
+    def per_round(self) -> dict[str, np.ndarray]:
+        """Measures of each round, float64 (B, rounds), NaN before it has ended.
+
+        feasible, makespan (adjusted, as in `objectives`), makespan_feasible (NaN where infeasible), conflicts.
+        """
+        rounds = self.state.rounds
+        ended = np.arange(self.horizon) < self.state.rows["round"][:, None]
+        feasible = rounds["feasible"]
+        measures = {
+            "feasible": feasible,
+            "makespan": np.where(feasible, rounds["makespan"], rounds["worst"]),
+            "makespan_feasible": np.where(feasible, rounds["makespan"], np.nan),
+            "conflicts": rounds["conflicts"],
+        }
+        return {name: np.where(ended, values, np.nan) for name, values in measures.items()}
 
     def round_results(self, row: int) -> np.ndarray:
         """A copy of the ended rounds' results, state.ROUND (n,)."""

@@ -93,11 +93,15 @@ def hears(state: State, b: int, viewer: int, comm: float, heard: np.ndarray) -> 
 def senses(state: State, b: int, viewer: int, sensing: float, seen: np.ndarray) -> int:
     """Which tasks the viewer sees: writes bool (N,), returns how many."""
     n = state.rows[b].n_tasks
+    seen[n:] = False
+    if sensing == EVERYWHERE:
+        seen[:n] = True
+        return n
     x, y = standpoint(state, b, viewer)
     near = np.zeros(n, np.bool_)
     for task in range(n):
         near[task] = np.hypot(state.tasks[b, task].x - x, state.tasks[b, task].y - y) <= sensing
-    seen[:] = False
+    seen[:n] = False
     count = 0
     for task in range(n):
         seen[task] = near[task]
