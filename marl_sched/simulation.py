@@ -98,6 +98,13 @@ class TurnSimulator(ABC):
     def objectives(self) -> dict[str, np.ndarray]:
         """The domain's measures of the running or finished episodes, name -> float64 (B,)."""
 
+    def per_round(self) -> dict[str, np.ndarray]:
+        """Measures of each round of an episode, name -> float64 (B, rounds), NaN where there is nothing to measure.
+
+        Empty for domains whose episodes have no rounds.
+        """
+        return {}
+
     @abstractmethod
     def snapshot(self, row: int) -> dict[str, np.ndarray]:
         """Copies of all arrays of one row's true state, for traces, rendering and bit-equality tests."""

@@ -25,6 +25,7 @@ from marl_sched.simulation import TurnSimulator
 
 SCHEMA = 1
 BATCH = 1024
+SCALES = ("small", "large")
 _AEC_TURNS = 5_000
 _TORCHRL_STEPS = 100
 _POLICY_DECISIONS = 200
@@ -44,12 +45,11 @@ def bench(domain: Domain, *, repeats: int = 5) -> dict[str, Any]:
     torch.set_num_threads(1)
     try:
         own, meanings = _OWN[domain.name](domain, repeats) if domain.name in _OWN else ({}, {})
-        scales = list(domain.scales)
         figures = {
             **own,
             "aec_turns_per_s": aec_turns_per_second(domain, repeats),
             "torchrl_decisions_per_s": torchrl_decisions_per_second(domain, repeats),
-            "policy_ms": {scale: policy_milliseconds(domain, scale, repeats) for scale in (scales[0], scales[-1])},
+            "policy_ms": {scale: policy_milliseconds(domain, scale, repeats) for scale in SCALES},
         }
     finally:
         torch.set_num_threads(threads)

@@ -27,7 +27,8 @@ from marl_sched.simulation import TurnSimulator
 from marl_sched.statistics import Summary, paired_difference, percent_gain, summarise
 
 SCHEMA = 1
-REFERENCE = "reference"  # the key of Domain.extras under which a domain names its reference scheduler
+# Keys of Domain.extras: the name of the reference scheduler, what the horizon counts, which M1 is the better one.
+REFERENCE, UNIT, BETTER = "reference", "unit", "better"
 SHARE_EVERY = 8  # turns between two readings of the visible share
 _CHUNK_CELLS = 512 * 41 * 16  # pairs of target and agent in flight: 512 rows of a small AirME fleet
 
@@ -93,6 +94,7 @@ class Scores:
         measures: the simulator's `objectives()` at the end of each episode, name -> float64 (I, E).
         visible_share: share of the graph that acting agents saw, mean over turns.
         seconds: wall time of all episodes, simulation included.
+        per_round: the simulator's `per_round()`, name -> float64 (I, E, rounds); empty where there are no rounds.
         needs: what the scheduler uses beyond the acting agent's observation, "" for nothing.
     """
 
@@ -100,6 +102,7 @@ class Scores:
     visible_share: float
     seconds: float
     needs: str = ""
+    per_round: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
 def evaluate_scheduler(
@@ -121,6 +124,7 @@ def evaluate_scheduler(
     started = time.perf_counter()
     total = len(instances) * settings.episodes
     measures: list[dict[str, np.ndarray]] = []
+    per_round: list[dict[str, np.ndarray]] = []
     shares, turns = 0.0, 0
     for rows in _chunks(total, max_rows or _rows_that_fit(domain, instances, settings)):
         simulator = settings.simulator(domain, [instances[row // settings.episodes] for row in rows])
@@ -137,13 +141,20 @@ def evaluate_scheduler(
                     progress((rows.start + len(rows) * _played(simulator)) / total)
             simulator.step(scheduler.decide(simulator))
         measures.append(simulator.objectives())
-    shape = (len(instances), settings.episodes)
+        per_round.append(simulator.per_round())
     return Scores(
-        measures={name: np.concatenate([part[name] for part in measures]).reshape(shape) for name in measures[0]},
+        measures=_joined(measures, len(instances)),
+        per_round=_joined(per_round, len(instances)),
         visible_share=float(shares / turns),
         seconds=time.perf_counter() - started,
         needs=scheduler.needs,
     )
+
+
+def _joined(parts: list[dict[str, np.ndarray]], n_instances: int) -> dict[str, np.ndarray]:
+    """Arrays of consecutive rows, name -> (rows, ...), as one of shape (I, E, ...)."""
+    whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return {name: values.reshape(n_instances, -1, *values.shape[1:]) for name, values in whole.items()}
 
 
 def _visible_share(simulator: TurnSimulator) -> np.ndarray:
@@ -171,7 +182,7 @@ class Table:
     """Schedulers side by side: what every plot and every printed table is drawn from.
 
     Attributes:
-        env: the domain's name.
+        domain: what was played.
         settings: with objective and horizon filled in.
         n_instances: number of instances.
         scores: name as the user typed it -> scores.
@@ -180,7 +191,7 @@ class Table:
         baseline: the name of what paired differences are taken to, and its scores.
     """
 
-    env: str
+    domain: Domain
     settings: Settings
     n_instances: int
     scores: Mapping[str, Scores]
@@ -192,13 +203,14 @@ class Table:
         settings = self.settings
         data: dict[str, Any] = {
             "schema": SCHEMA,
-            "env": self.env,
+            "env": self.domain.name,
             "scale": settings.scale,
             "objective": settings.objective,
+            "better": self.domain.extras.get(BETTER, "higher"),
             "view": {**view_as_json(settings.view), "visible_share": self.visible_share},
             "instances": self.n_instances,
             "episodes": settings.episodes,
-            "hours": settings.horizon,
+            self.domain.extras.get(UNIT, "hours"): settings.horizon,
             "seed": settings.seed,
             "options": dict(settings.options),
             "baseline": self.baseline[0],
@@ -224,6 +236,8 @@ class Table:
             row["M2"] = self._summary(gain).as_json()
         for name, values in scores.measures.items():
             row[name] = row["M1"] if name == objective else self._summary(values).as_json()
+        for name, values in scores.per_round.items():
+            row[name] = {"mean": _mean(values), **row.get(name, {}), "per_round": _by_round(values)}
         difference = paired_difference(m1, self.baseline[1].measures[objective])
         row["difference"] = {"to": self.baseline[0], **difference.as_json()}
         row["visible_share"] = scores.visible_share
@@ -273,13 +287,23 @@ def evaluate(
         held_against = (reference.name, under_full_view)
         comparable.setdefault(*held_against)
     return Table(
-        env=domain.name,
+        domain=domain,
         settings=settings,
         n_instances=len(instances),
         scores=scores,
         reference=held_against,
         baseline=(baseline, comparable[baseline]),
     )
+
+
+def _mean(values: np.ndarray) -> float | None:
+    """The mean of what was measured, None if nothing was; JSON knows no NaN."""
+    measured = values[~np.isnan(values)]
+    return float(measured.mean()) if measured.size else None
+
+
+def _by_round(values: np.ndarray) -> list[float | None]:
+    return [_mean(values[..., k]) for k in range(values.shape[-1])]
 
 
 def view_as_json(view: Any) -> dict[str, Any]:

@@ -35,7 +35,7 @@ def score_bars(*tables: Mapping[str, Any]) -> Figure:
     Tables differ in colour and are told apart by their views.
     """
     rows = [(name, row["M1"], i) for i, table in enumerate(tables) for name, row in table["schedulers"].items()]
-    rows.sort(key=lambda row: row[1]["mean"])
+    rows.sort(key=lambda row: row[1]["mean"], reverse=tables[0]["better"] == "lower")
     scores = [score for _, score, _ in rows]
     iqm = np.array([score["iqm"] for score in scores])
     low, high = np.array([score["ci95"] for score in scores]).T
@@ -53,7 +53,8 @@ def score_bars(*tables: Mapping[str, Any]) -> Figure:
         )
     axes.set_yticks(y, [name for name, _, _ in rows])
     axes.set_xlim(min(0.0, 1.05 * low.min()), 1.12 * right or 1.0)
-    axes.set_xlabel(f"M1: mean {tables[0]['objective']} over {tables[0]['hours']} hours")
+    unit = "hours" if "hours" in tables[0] else "rounds"
+    axes.set_xlabel(f"M1: mean {tables[0]['objective']} over {tables[0][unit]} {unit}")
     axes.set_title(_conditions(tables[0]), fontsize=10, loc="left")
     _plain(axes)
     axes.grid(axis="x", color=_FAINT, lw=0.6)

@@ -52,6 +52,7 @@ class Plant:
     reach: options.Reach = None
     comm: options.Comm = None
     staleness: options.Staleness = None
+    sensing: options.Sensing = None
     run: Annotated[str, typer.Option("--run", help="The run's name, by which its processes find each other.")] = "run"
     deadline: Annotated[float, typer.Option("--deadline", help="Seconds that a decision may take.")] = 2.0
     patience: Annotated[

@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
@@ -18,26 +18,35 @@ if TYPE_CHECKING:
 Env = Annotated[str, typer.Option("--env", help="The environment; `marl-sched list` shows all.")]
 Scale = Annotated[str, typer.Option("--scale", help="Size of generated instances.")]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of instances and noise.")]
-Hours = Annotated[
-    int | None, typer.Option("--hours", min=1, help="Simulated time of an episode (default: the environment's own).")
-]
+Hours = Annotated[int | None, typer.Option("--hours", min=1, help="airme: hours of an episode (default 720).")]
 View = Annotated[str, typer.Option("--view", help="What an acting agent sees: full or local.")]
 Reach = Annotated[
     int | None, typer.Option("--reach", metavar="R", help="view local: sectors seen either side (default 1).")
 ]
 Comm = Annotated[
-    int | None, typer.Option("--comm", metavar="C", help="view local: agents heard either side (default 1).")
+    float | None,
+    typer.Option("--comm", metavar="C", help="view local: how far agents hear (airme: crews either side, default 1)."),
 ]
 Staleness = Annotated[
     int | None, typer.Option("--staleness", metavar="H", help="view local: age of others' data (default 0).")
 ]
+Sensing = Annotated[
+    float | None, typer.Option("--sensing", metavar="D", help="murse, view local: how far agents see (default 4).")
+]
 JsonFile = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the results here.")]
 
-VIEW_OPTIONS = ("reach", "comm", "staleness")
-# Options of simulators and the environments that have them; given to another environment they are an error.
-SIMULATOR_OPTIONS: Mapping[str, frozenset[str]] = {
-    "failure": frozenset({"airme"}),
-    "scheme": frozenset({"airme"}),
+VIEW_OPTIONS = ("reach", "comm", "staleness", "sensing")
+# Options that only some environments have: option -> environment -> the simulator's argument. Given to another
+# environment an option is an error.
+SIMULATOR_OPTIONS: Mapping[str, Mapping[str, str]] = {
+    "hours": {"airme": "horizon"},
+    "failure": {"airme": "failure"},
+    "scheme": {"airme": "scheme"},
+    "rounds": {"murse": "horizon"},
+    "mode": {"murse": "mode"},
+    "durations": {"murse": "durations"},
+    "proximity": {"murse": "proximity"},
+    "picking": {"murse": "picking"},
 }
 
 
@@ -48,22 +57,25 @@ def build_view(domain: Domain, name: str, options: Mapping[str, Any]) -> Any:
     the view does not have.
     """
     kind = domain.views[require(f"view of {domain.name}", name, domain.views)]
+    types = get_type_hints(kind)
     known = [field.name for field in fields(kind)]
     given = _given(options)
-    for option in given:
+    for option, value in given.items():
         if option not in known:
             has = ", ".join(f"--{field}" for field in known) or "no options"
             raise InvalidOptionError(f"--{option}: the view {name!r} of {domain.name} has {has}")
-    return kind(**given)
+        if types[option](value) != value:
+            raise InvalidOptionError(f"--{option}: expected an integer, got {value}")
+    return kind(**{option: types[option](value) for option, value in given.items()})
 
 
 def simulator_options(domain: Domain, options: Mapping[str, Any]) -> dict[str, Any]:
-    """The simulator's own options that were given; InvalidOptionError for one of another domain."""
+    """The simulator's arguments for the options that were given; InvalidOptionError for another domain's option."""
     given = _given(options)
     for name in given:
         if domain.name not in SIMULATOR_OPTIONS[name]:
             raise InvalidOptionError(f"--{name}: the environment {domain.name!r} has no such option")
-    return given
+    return {SIMULATOR_OPTIONS[name][domain.name]: value for name, value in given.items()}
 
 
 def load_instances(domain: Domain, source: str, scale: str, seed: int) -> tuple[list[Any], str | None]:

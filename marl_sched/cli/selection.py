@@ -44,8 +44,14 @@ class Selection:
     reach: options.Reach = None
     comm: options.Comm = None
     staleness: options.Staleness = None
+    sensing: options.Sensing = None
     failure: Annotated[str | None, typer.Option("--failure", help="airme: density as published, or hazard.")] = None
     scheme: Annotated[str | None, typer.Option("--scheme", help="airme: full, skip or single.")] = None
+    rounds: Annotated[int | None, typer.Option("--rounds", min=1, help="murse: rounds of an episode.")] = None
+    mode: Annotated[str | None, typer.Option("--mode", help="murse: plan or online.")] = None
+    durations: Annotated[str | None, typer.Option("--durations", help="murse: deterministic or stochastic.")] = None
+    proximity: Annotated[str | None, typer.Option("--proximity", help="murse: distance, location or none.")] = None
+    picking: Annotated[str | None, typer.Option("--picking", help="murse: which free agent decides first.")] = None
 
     def resolve(self) -> Resolved:
         """The objects that the words stand for, or an error that says which word is wrong."""
@@ -54,13 +60,14 @@ class Selection:
 
         domain = get_domain(self.env)
         words = asdict(self)
+        own = options.simulator_options(domain, {name: words[name] for name in options.SIMULATOR_OPTIONS})
         settings = Settings(
             episodes=self.episodes,
             seed=self.seed,
             objective=domain.require_objective(self.objective) if self.objective else None,
-            horizon=self.hours,
+            horizon=own.pop("horizon", None),
             view=options.build_view(domain, self.view, {name: words[name] for name in options.VIEW_OPTIONS}),
-            options=options.simulator_options(domain, {name: words[name] for name in options.SIMULATOR_OPTIONS}),
+            options=own,
         )
         schedulers = create_schedulers(domain, self.schedulers)
         instances, scale = options.load_instances(domain, self.instances, self.scale, self.seed)

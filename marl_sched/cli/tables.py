@@ -20,7 +20,8 @@ def print_scores(results: dict[str, Any]) -> None:
     gain = ["M2 %"] if "reference" in results else []
     for heading in ("M1", "IQM", f"less {results['baseline']}", *gain, *measures):
         table.add_column(heading, justify="right", min_width=7)
-    for name, row in sorted(results["schedulers"].items(), key=lambda item: -item[1]["M1"]["mean"]):
+    lower = results["better"] == "lower"
+    for name, row in sorted(results["schedulers"].items(), key=lambda item: item[1]["M1"]["mean"], reverse=not lower):
         m1, difference = row["M1"], row["difference"]
         cells = [
             f"{m1['mean']:.4f}\n± {m1['std']:.3f}",
@@ -35,7 +36,13 @@ def print_scores(results: dict[str, Any]) -> None:
 
 def _title(results: dict[str, Any]) -> str:
     scale = results["scale"] or "given"
-    return f"{results['env']}, {scale} instances: M1 is mean {results['objective']} over {results['hours']} hours"
+    return f"{results['env']}, {scale} instances: M1 is mean {results['objective']} over {horizon(results)}"
+
+
+def horizon(results: dict[str, Any]) -> str:
+    """What an episode lasts: `720 hours`."""
+    unit = "hours" if "hours" in results else "rounds"
+    return f"{results[unit]} {unit}"
 
 
 def _caption(results: dict[str, Any]) -> str:
@@ -65,7 +72,7 @@ def print_bench(figures: dict[str, Any]) -> None:
 def _other_measures(results: dict[str, Any]) -> list[str]:
     row = next(iter(results["schedulers"].values()))
     known = ("M1", "M2", "difference", results["objective"])
-    return [name for name, value in row.items() if isinstance(value, dict) and name not in known]
+    return [name for name, value in row.items() if isinstance(value, dict) and "std" in value and name not in known]
 
 
 def _interval(bounds: list[float] | None) -> str:

@@ -13,7 +13,7 @@ from marl_sched.cli.app import app as application
 from marl_sched.domain import get_domain
 
 COMMANDS = [
-    "generate", "evaluate", "compare", "bench", "train", "resume",
+    "generate", "evaluate", "compare", "bench", "bound", "train", "resume",
     "world", "agent", "deploy", "demo", "list", "doctor",
 ]  # fmt: skip
 AIRME = get_domain("airme")
@@ -53,6 +53,7 @@ def test_version_is_that_of_the_installed_package(run):
 def test_list_names_environments_schedulers_and_views(run):
     out = run("list").out
     assert "airme" in out
+    assert "murse" in out
     assert all(rule in out for rule in RULES)
     assert "local(reach=1, comm=1, staleness=0)" in out
 

@@ -22,6 +22,7 @@ def table(share, **rows):
         "env": "airme",
         "scale": "small",
         "objective": "profit",
+        "better": "higher",
         "view": {"kind": "local", "visible_share": share},
         "instances": 2,
         "episodes": 3,

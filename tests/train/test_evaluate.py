@@ -97,7 +97,7 @@ def test_a_table_worked_out_by_hand():
     better = scores_of([[0.5, 0.7], [0.6, 0.6]], share=0.25)
     reference = scores_of([[0.4, 0.4], [0.5, 0.7]])
     table = Table(
-        env="airme",
+        domain=AIRME,
         settings=settings(view=LocalView(reach=2), objective="profit"),
         n_instances=2,
         scores={"better": better},
@@ -202,3 +202,21 @@ def test_serving_worn_planes_first_keeps_its_score_on_every_scale(scale, count):
         AIRME, RULES["preventive-first"](), instances, Settings(episodes=2, seed=1, scale=scale)
     )
     assert scores.measures["profit"].mean() >= 0.700
+
+
+def test_rounds_are_told_one_by_one_and_failures_count():
+    murse = get_domain("murse")
+    instances = murse.instances("small", 3, 1)
+    few = Settings(episodes=2, seed=1, horizon=3, scale="small")
+    table = evaluate(murse, {"random": RULES["random"]()}, instances, few).as_json()
+    row = table["schedulers"]["random"]
+    assert (table["rounds"], table["better"], "hours" in table) == (3, "lower", False)
+    for name in ("feasible", "makespan"):
+        assert len(row[name]["per_round"]) == 3
+        assert np.mean(row[name]["per_round"]) == pytest.approx(row[name]["mean"])
+    assert row["M1"]["mean"] == row["makespan"]["mean"]
+    assert 0 <= row["feasible"]["mean"] < 1
+    if row["feasible"]["mean"] == 0:
+        assert row["makespan_feasible"] == {"mean": None, "per_round": [None, None, None]}
+    else:
+        assert row["makespan_feasible"]["mean"] < row["makespan"]["mean"]
