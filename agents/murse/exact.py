@@ -132,7 +132,11 @@ class _Model:
             for i in np.flatnonzero(problem.near.any(axis=1)).tolist()
         }
         for i, j in np.argwhere(np.triu(problem.near)).tolist():
-            model.add_no_overlap([spans[i], spans[j]])
+            if (problem.fixed[i] >= 0) == (problem.fixed[j] >= 0):
+                model.add_no_overlap([spans[i], spans[j]])
+            else:  # what is committed to goes first
+                first, second = (i, j) if problem.fixed[i] >= 0 else (j, i)
+                model.add(self.starts[second] >= self.ends[first])
 
     def _length(self, i: int) -> Any:
         longest = int(self.problem.durations[i].max())

@@ -1,0 +1,47 @@
+"""A running round of the simulator as the problem that a planner is given."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from marl_sched.agents.murse.problem import Round
+from marl_sched.envs.murse.instance import NO_DEADLINE
+from marl_sched.envs.murse.simulator import MurseSimulator
+from marl_sched.envs.murse.state import NOBODY
+from marl_sched.envs.murse.views import EVERYWHERE, look
+from marl_sched.errors import InvalidOptionError
+from marl_sched.simulation import TurnSimulator
+
+
+def as_murse(simulator: TurnSimulator) -> MurseSimulator:
+    """The simulator as one of MuRSE; InvalidOptionError for any other."""
+    if not isinstance(simulator, MurseSimulator):
+        raise InvalidOptionError(f"scheduler of murse: expected a simulator of murse, got {type(simulator).__name__}")
+    return simulator
+
+
+def estimated_round(simulator: MurseSimulator, row: int) -> Round:
+    """The whole of a row's present round on the durations that the team counts on."""
+    instance = simulator.instances[row]
+    planned = simulator.state.pairs["planned"][row, : instance.n_tasks, : instance.n_agents]
+    return Round.of(instance, np.where(instance.eligible, planned, 0))
+
+
+def remaining_round(simulator: MurseSimulator, row: int) -> Round:
+    """What is left of a row's round: committed tasks with their believed times, agents when they are believed free.
+
+    Nobody is free before now. A committed task has no deadline any more: nothing can be done about it.
+    """
+    whole, state = estimated_round(simulator, row), simulator.state
+    n, clock = whole.n_tasks, int(state.rows["clock"][row])
+    sight = look(state, simulator.rules, row, int(simulator.acting[row]), EVERYWHERE, EVERYWHERE)
+    agents = state.tasks["agent"][row, :n].copy()
+    taken = np.flatnonzero(agents != NOBODY)
+    durations, ready = whole.durations.copy(), np.full(whole.n_agents, clock)
+    fixed, deadlines = np.full(n, -1), whole.deadlines.copy()
+    durations[taken, agents[taken]] = (sight.finish - sight.start)[taken]
+    fixed[taken], deadlines[taken] = sight.start[taken], NO_DEADLINE
+    np.maximum.at(ready, agents[taken], sight.finish[taken])
+    return replace(whole, durations=durations, deadlines=deadlines, fixed=fixed, agents=agents, ready=ready)

@@ -1,0 +1,27 @@
+"""Counting what agents say to each other, by row and round."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from marl_sched.envs.murse.simulator import MurseSimulator
+
+
+class Traffic:
+    """Messages and bytes of every row and round, int64 (B, R); a message counts once, whoever hears it."""
+
+    def __init__(self) -> None:
+        self.messages, self.bytes = np.zeros((0, 0), np.int64), np.zeros((0, 0), np.int64)
+
+    def restart(self, simulator: MurseSimulator, rows: np.ndarray) -> None:
+        """Set the counters of `rows`, bool (B,), to 0."""
+        shape = (simulator.batch, simulator.horizon)
+        if self.messages.shape != shape:
+            self.messages, self.bytes = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
+        self.messages[rows], self.bytes[rows] = 0, 0
+
+    def add(self, simulator: MurseSimulator, row: int, messages: int, size: int) -> None:
+        """Count in the round that is being played."""
+        now = int(simulator.state.rows["round"][row])
+        self.messages[row, now] += messages
+        self.bytes[row, now] += size

@@ -1,0 +1,19 @@
+"""The schedulers of MuRSE by name; they live in `marl_sched.agents.murse`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from marl_sched.agents.base import Scheduler
+from marl_sched.agents.murse.optimal import ExactScheduler, RollingScheduler
+from marl_sched.agents.murse.rules import EdfPublished, FirstClaim, RandomRule, edf, hctf
+
+RULES: dict[str, Callable[..., Scheduler]] = {
+    "random": RandomRule,
+    "edf": edf,
+    "edf-published": EdfPublished,
+    "hctf": hctf,
+    "first-claim": FirstClaim,
+    "exact": ExactScheduler,
+    "exact-rolling": RollingScheduler,
+}
