@@ -50,7 +50,7 @@ def shipped(checkpoint, monkeypatch):
 
 
 def test_every_rule_of_airme_is_found_by_its_name():
-    assert scheduler_names("airme")[: len(RULES)] == RULES
+    assert set(RULES) <= set(scheduler_names("airme"))
     for name in RULES:
         assert create_scheduler(name, "airme").name == name
 
@@ -67,7 +67,8 @@ def test_an_unknown_scheduler_gets_a_suggestion_and_the_known_names():
 
 
 def test_a_shipped_policy_is_found_by_its_name_in_its_own_domain_only(shipped):
-    assert scheduler_names("airme") == [*RULES, "mine"]
+    assert scheduler_names("airme")[-1] == "mine"
+    assert "mine" not in scheduler_names("murse")
     policy = create_scheduler("mine", "airme", mode="sample")
     assert isinstance(policy, HetGATPolicy)
     assert (policy.name, policy.mode) == ("mine", "sample")
