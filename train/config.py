@@ -7,7 +7,9 @@ outside its bounds gives one line that says where.
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
@@ -19,7 +21,8 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from marl_sched.domain import get_domain
-from marl_sched.errors import InvalidOptionError
+from marl_sched.errors import InvalidFileError, InvalidOptionError
+from marl_sched.files import read_json
 
 Count = Annotated[int, Meta(ge=1)]
 Natural = Annotated[int, Meta(ge=0)]
@@ -128,6 +131,20 @@ class TrainConfig(_Config, frozen=True, kw_only=True):
         return _view(self)
 
 
+class RunRecord(_Config, frozen=True, kw_only=True):
+    """`config.json` of a run: the configuration, the overrides that gave it, the source that it runs on."""
+
+    config: TrainConfig
+    overrides: list[str]
+    revision: str
+
+    @property
+    def command(self) -> str:
+        """What to type to make the run again, wherever it is written."""
+        overrides = (override for override in self.overrides if not override.startswith("run_dir="))
+        return shlex.join(["marl-sched", "train", *overrides])
+
+
 def load_config(overrides: Sequence[str]) -> TrainConfig:
     """The configuration that Hydra overrides such as `view=local view.reach=2` make of `configs/train.yaml`.
 
@@ -140,15 +157,25 @@ def load_config(overrides: Sequence[str]) -> TrainConfig:
             composed = OmegaConf.to_container(compose("train", list(overrides)), resolve=True)
     except (HydraException, OmegaConfBaseException) as error:
         raise InvalidOptionError(f"train: {_one_line(error)}") from error
-    return config_from(composed)
-
-
-def config_from(data: Any) -> TrainConfig:
-    """The configuration in plain data, as `load_config` composes it and `msgspec.to_builtins` gives it back."""
     try:
-        config = msgspec.convert(data, TrainConfig)
+        config = msgspec.convert(composed, TrainConfig)
     except msgspec.ValidationError as error:
         raise InvalidOptionError(f"train: {error}") from error
+    return _checked(config)
+
+
+def load_record(path: Path) -> RunRecord:
+    """The record of a run, from its `config.json`; InvalidFileError if it does not hold one."""
+    try:
+        record = msgspec.convert(read_json(path), RunRecord)
+    except msgspec.ValidationError as error:
+        raise InvalidFileError(path, "", f"the record of a training run: {error}") from error
+    _checked(record.config)
+    return record
+
+
+def _checked(config: TrainConfig) -> TrainConfig:
+    """Look up every name in the registry of domains."""
     domain = get_domain(config.env.name)
     for scale in config.env.scales:
         domain.require_scale(scale)

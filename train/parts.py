@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from marl_sched.envs.torchrl_env import SchedulingTorchRL
 from marl_sched.graph import GraphSpec
 from marl_sched.train.checkpoint import Counters, load_checkpoint, save_checkpoint
 from marl_sched.train.collect import Collector, EpisodeCollector, InstanceSource, SegmentCollector
-from marl_sched.train.config import GaeConfig, StepBaselineConfig, TrainConfig
+from marl_sched.train.config import GaeConfig, RunRecord, StepBaselineConfig, TrainConfig
 from marl_sched.train.curriculum import EpisodeLength
 from marl_sched.train.estimators import CriticEstimator, Estimator, StepBaseline
 from marl_sched.train.export import save_best
@@ -27,7 +26,7 @@ from marl_sched.train.validation import Validation
 class Parts:
     """The parts of a run, and what is done with all of them at once."""
 
-    config: TrainConfig
+    record: RunRecord
     collector: Collector
     estimator: Estimator
     ppo: Ppo
@@ -39,19 +38,21 @@ class Parts:
         """The metagraph of what is learned on."""
         return self.collector.env.simulator.graph
 
-    def validate(self, counters: Counters, directory: Path, overrides: Sequence[str]) -> dict[str, float]:
+    def validate(self, counters: Counters, directory: Path) -> dict[str, float]:
         """Play the validation instances if it is time to, and keep the policy if it is the best so far."""
-        if counters.update % self.config.validation.every and counters.update != self.config.updates:
+        config = self.record.config
+        if counters.update % config.validation.every and counters.update != config.updates:
             return {}
         score = self.validation(self.ppo.policy)
         if counters.best is None or score > counters.best:
             counters.best = score
-            save_best(self.ppo.policy, self.config, counters.update, score, directory, overrides)
+            save_best(self.ppo.policy, self.record, counters.update, score, directory)
         return {"validation": score, "best": counters.best}
 
     def save(self, counters: Counters, directory: Path) -> None:
         """Write a checkpoint if it is time to."""
-        if counters.update % self.config.save_every and counters.update != self.config.updates:
+        config = self.record.config
+        if counters.update % config.save_every and counters.update != config.updates:
             return
         save_checkpoint(directory, counters, self.ppo, self.estimator.state(), self.collector.state())
 
@@ -63,9 +64,9 @@ class Parts:
         return numbers.counters
 
 
-def build(config: TrainConfig) -> Parts:
-    """The parts that a configuration names, with freshly drawn networks."""
-    algorithm = config.algorithm
+def build(record: RunRecord) -> Parts:
+    """The parts that a run's configuration names, with freshly drawn networks."""
+    config, algorithm = record.config, record.config.algorithm
     length = EpisodeLength(**msgspec.structs.asdict(config.curriculum), seed=config.seed)
     with torch.random.fork_rng():
         torch.manual_seed(config.seed)
@@ -75,7 +76,7 @@ def build(config: TrainConfig) -> Parts:
             collector, estimator, critic = _with_step_baseline(config, algorithm, length)
         policy = HetGATNetwork(collector.env.simulator.graph, **msgspec.structs.asdict(config.policy))
     ppo = Ppo(policy, critic, algorithm.ppo)
-    return Parts(config, collector, estimator, ppo, length, Validation(config))
+    return Parts(record, collector, estimator, ppo, length, Validation(config))
 
 
 _Chosen = tuple[Collector, Estimator, HetGATCritic | None]

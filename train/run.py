@@ -11,11 +11,12 @@ import msgspec
 import numpy as np
 import torch
 
-from marl_sched.errors import InvalidFileError, InvalidOptionError
-from marl_sched.files import read_json, write_json
+from marl_sched.agents.cards import source_revision
+from marl_sched.errors import InvalidOptionError
+from marl_sched.files import write_json
 from marl_sched.train.checkpoint import Counters
 from marl_sched.train.collect import Rollout
-from marl_sched.train.config import TrainConfig, config_from, load_config
+from marl_sched.train.config import RunRecord, load_config, load_record
 from marl_sched.train.estimators import Estimate
 from marl_sched.train.logging import RunLog
 from marl_sched.train.parts import build
@@ -34,25 +35,22 @@ def train_from_overrides(overrides: Sequence[str], *, quiet: bool = False) -> Pa
     directory = Path(config.directory())
     if (directory / CONFIG).exists():
         raise InvalidOptionError(f"run_dir: {directory} holds a run already; resume it or choose another")
-    write_json(directory / CONFIG, {"overrides": list(overrides), "config": msgspec.to_builtins(config)})
-    return train(config, directory, list(overrides), quiet=quiet)
+    record = RunRecord(config=config, overrides=list(overrides), revision=source_revision())
+    write_json(directory / CONFIG, msgspec.to_builtins(record))
+    return train(record, directory, quiet=quiet)
 
 
 def resume(run_dir: str | Path, *, quiet: bool = False) -> Path:
     """Go on with a run from its last checkpoint, exactly as if it had not stopped."""
     directory = Path(run_dir)
-    saved = read_json(directory / CONFIG)
-    if not isinstance(saved, dict) or "config" not in saved:
-        raise InvalidFileError(directory / CONFIG, "config", "a training configuration")
-    return train(config_from(saved["config"]), directory, saved.get("overrides", []), resumed=True, quiet=quiet)
+    return train(load_record(directory / CONFIG), directory, resumed=True, quiet=quiet)
 
 
-def train(
-    config: TrainConfig, directory: Path, overrides: Sequence[str], *, resumed: bool = False, quiet: bool = False
-) -> Path:
+def train(record: RunRecord, directory: Path, *, resumed: bool = False, quiet: bool = False) -> Path:
     """The loop. Everything random in an update is a function of (seed, update, instance number)."""
+    config = record.config
     torch.set_num_threads(config.threads)
-    parts = build(config)
+    parts = build(record)
     counters = parts.restore(directory) if resumed else Counters()
     with RunLog(directory, updates=config.updates, start=counters.update, quiet=quiet) as log:
         while counters.update < config.updates:
@@ -66,7 +64,7 @@ def train(
             counters.update += 1
             counters.hours += rollout.time
             counters.decisions += rollout.decisions
-            scores = parts.validate(counters, directory, overrides)
+            scores = parts.validate(counters, directory)
             counters.seconds += time.perf_counter() - started
             log.update(_row(counters, rollout, estimate, report) | scores)
             parts.save(counters, directory)

@@ -1,11 +1,14 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 import msgspec
 import pytest
 
 from marl_sched.envs.airme.views import FullView, LocalView
-from marl_sched.errors import InvalidOptionError, UnknownNameError
-from marl_sched.train.config import GaeConfig, StepBaselineConfig, config_from, load_config
+from marl_sched.errors import InvalidFileError, InvalidOptionError, UnknownNameError
+from marl_sched.files import write_json
+from marl_sched.train.config import GaeConfig, RunRecord, StepBaselineConfig, load_config, load_record
 
 
 def test_defaults_are_the_recipe_of_the_full_view():
@@ -54,6 +57,16 @@ def test_unknown_names_are_refused_before_anything_runs(override: str):
         load_config([override])
 
 
-def test_a_configuration_survives_its_json():
-    config = load_config(["view=local"])
-    assert config_from(msgspec.json.decode(msgspec.json.encode(config))) == config
+def test_a_record_survives_its_file_and_names_the_command_without_its_place(tmp_path: Path):
+    overrides = ["view=local", "env.scales=[small, medium]", "run_dir=/somewhere"]
+    record = RunRecord(config=load_config(overrides), overrides=overrides, revision="abc")
+    write_json(tmp_path / "config.json", msgspec.to_builtins(record))
+    assert load_record(tmp_path / "config.json") == record
+    assert record.command == "marl-sched train view=local 'env.scales=[small, medium]'"
+
+
+def test_a_record_with_an_unknown_key_is_refused_by_file(tmp_path: Path):
+    record = RunRecord(config=load_config([]), overrides=[], revision="")
+    write_json(tmp_path / "config.json", msgspec.to_builtins(record) | {"rounds": 3})
+    with pytest.raises(InvalidFileError, match=r"config\.json: expected the record of a training run: .*rounds"):
+        load_record(tmp_path / "config.json")

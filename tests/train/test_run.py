@@ -10,7 +10,7 @@ from safetensors.torch import load_file
 from marl_sched.agents.hetgat.policy import HetGATPolicy
 from marl_sched.errors import InvalidFileError, InvalidOptionError
 from marl_sched.files import read_json
-from marl_sched.train.config import load_config
+from marl_sched.train.config import RunRecord, load_config
 from marl_sched.train.logging import RunLog
 from marl_sched.train.parts import build
 from marl_sched.train.run import resume, train_from_overrides
@@ -76,7 +76,7 @@ def test_learning_changes_the_weights_and_seeds_change_the_run(tmp_path: Path):
         runs[seed] = checkpoint(
             train_from_overrides([*GAE, f"seed={seed}", f"run_dir={tmp_path / str(seed)}"], quiet=True)
         )
-    fresh = build(load_config([*GAE, "seed=0"])).ppo.policy.state_dict()
+    fresh = build(RunRecord(config=load_config(GAE), overrides=GAE, revision="")).ppo.policy.state_dict()
     changed = [not np.array_equal(tensor.numpy(), runs[0][f"policy.{name}"]) for name, tensor in fresh.items()]
     assert any(changed)
     assert any(not np.array_equal(runs[0][name], runs[1][name]) for name in runs[0] if name.startswith("policy."))
