@@ -11,13 +11,15 @@ Student's with as many degrees of freedom as observations and prior have togethe
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from scipy.stats import t as student
 
 from marl_sched.envs.murse.learning import BETA, C_STD, EXPONENTIAL, K_STD, C, K, remaining_share, sample_curves
+
+Record = Any  # one element of a record array, whose fields compiled code reads as attributes
 
 POPULATION = 50
 PRIOR_WEIGHT = 5.0
@@ -65,7 +67,7 @@ def new_filters(prior: Prior, shape: tuple[int, ...]) -> np.ndarray:
 
 
 @njit(cache=True)
-def linearised(state, repetitions, learning):
+def linearised(state: Record, repetitions: int, learning: int) -> tuple[float, tuple[float, float, float]]:
     """Expected duration and its derivatives by c, k and log beta: (float, (float, float, float))."""
     k, beta = state.mean[1], np.exp(state.mean[2])
     share = remaining_share(beta, repetitions, learning)
@@ -74,19 +76,19 @@ def linearised(state, repetitions, learning):
 
 
 @njit(cache=True)
-def noise_ratio(state, share):
+def noise_ratio(state: Record, share: float) -> float:
     """The noise variance when `share` of k is left, relative to that of the first execution."""
     return 1.0 - state.k_noise_share * (1.0 - share**2)
 
 
 @njit(cache=True)
-def noise_variance(state, share):
+def noise_variance(state: Record, share: float) -> float:
     """The present estimate of one execution's variance about the curve when `share` of k is left."""
     return noise_ratio(state, share) * state.noise_sum / (PRIOR_WEIGHT + state.updates)
 
 
 @njit(cache=True)
-def predict(state, repetitions, learning):
+def predict(state: Record, repetitions: int, learning: int) -> tuple[float, float]:
     """Mean and standard deviation (of curve and noise together) of the next duration before rounding and clipping."""
     expected, slopes = linearised(state, repetitions, learning)
     variance = noise_variance(state, slopes[1])
@@ -97,7 +99,7 @@ def predict(state, repetitions, learning):
 
 
 @njit(cache=True)
-def update(state, repetitions, learning, observed):
+def update(state: Record, repetitions: int, learning: int, observed: float) -> None:
     """Take in one observed whole duration of a human who had repeated the task `repetitions` times."""
     expected, slopes = linearised(state, repetitions, learning)
     gain = np.zeros(3)
@@ -118,7 +120,7 @@ def update(state, repetitions, learning, observed):
 
 
 @njit(cache=True)
-def predict_each(filters, repetitions, learning):
+def predict_each(filters: np.ndarray, repetitions: np.ndarray, learning: int) -> tuple[np.ndarray, np.ndarray]:
     """`predict` for each of FILTER (n,) after int64 (n,) repetitions: two float64 (n,)."""
     means, stds = np.empty(len(filters)), np.empty(len(filters))
     for j in range(len(filters)):
@@ -127,7 +129,7 @@ def predict_each(filters, repetitions, learning):
 
 
 @njit(cache=True)
-def update_each(filters, repetitions, learning, observed):
+def update_each(filters: np.ndarray, repetitions: np.ndarray, learning: int, observed: np.ndarray) -> None:
     """`update` for each of FILTER (n,), int64 (n,) repetitions and float64 (n,) observed durations."""
     for j in range(len(filters)):
         update(filters[j], repetitions[j], learning, observed[j])
