@@ -156,7 +156,7 @@ class Agent:
         if isinstance(said, wire.Turn):
             again = self._turn == said
             self._turn = said
-            if again and self._lacks() and self._catch_up():
+            if again and self._lacks(said) and self._catch_up():
                 return True
         self._decide()
         return False
@@ -193,14 +193,13 @@ class Agent:
             self._learn(channel, news)
         return snapshot.clock.phase == "over"
 
-    def _lacks(self) -> bool:
-        assert self._turn is not None
-        return any(self._versions.get(channel, 0) < sequence for channel, sequence in self._turn.needs.items())
+    def _lacks(self, turn: wire.Turn) -> bool:
+        return any(self._versions.get(channel, 0) < sequence for channel, sequence in turn.needs.items())
 
     def _decide(self) -> None:
         """Answer the turn if there is one and the belief is exactly as up to date as it asks for."""
         turn = self._turn
-        if turn is None or self._lacks():
+        if turn is None or self._lacks(turn):
             return
         self._turn = None
         if any(self._versions[channel] > sequence for channel, sequence in turn.needs.items()):

@@ -25,6 +25,7 @@ import numpy as np
 
 from marl_sched.agents.registry import create_scheduler, scheduler_names
 from marl_sched.comms.options import AgentOptions, DeployOptions
+from marl_sched.comms.report import absent
 from marl_sched.comms.session import settle_port
 from marl_sched.domain import Domain
 from marl_sched.errors import DeploymentError
@@ -32,7 +33,8 @@ from marl_sched.files import read_json, write_json
 
 WORLD = "world"
 POLL = 0.05  # seconds between two looks at the children
-GRACE = 2.0  # seconds that a child has to end by itself, and again when asked to, before it is killed
+LEAVE = 15.0  # seconds that agents have to leave when the run is over
+GRACE = 2.0  # seconds that a child has to end when asked to, before it is killed
 Progress = Callable[[str, int, int], None]  # (phase, simulated time, horizon)
 
 
@@ -141,9 +143,10 @@ class Deployment:
         if world.returncode != 0:
             raise DeploymentError(f"the world ended with {world.returncode}: {self.children[WORLD].complaint()}")
         report: dict[str, Any] = read_json(self._report)
-        end = time.monotonic() + GRACE
-        for child in self.children.values():
-            _wait(child.process, end)
+        end = time.monotonic() + LEAVE
+        for name, child in self.children.items():
+            if name not in absent(report["events"]):
+                _wait(child.process, end)
         report["exit_codes"] = {name: child.process.poll() for name, child in self.children.items()}
         return report
 
@@ -194,9 +197,7 @@ def _check_policy(policy: str, domain: Domain) -> None:
 
 def warm_up(options: DeployOptions) -> None:
     """Compile, once and to Numba's cache on disk, what all the processes are about to use."""
-    domain, simulator = options.world.domain(), options.world.simulator()
-    telemetry = domain.telemetry
-    assert telemetry is not None  # options.world.domain() refuses a domain without
+    telemetry, simulator = options.world.telemetry(), options.world.simulator()
     belief = telemetry.belief(telemetry.frame(simulator), 0)
     for channel, payload in telemetry.messages(simulator).items():
         if channel in belief.channels:

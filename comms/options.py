@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from marl_sched.comms.messages import run_prefix
-from marl_sched.domain import Domain, get_domain
+from marl_sched.domain import Domain, Telemetry, get_domain
 from marl_sched.errors import InvalidOptionError, require
 
 if TYPE_CHECKING:
@@ -64,11 +64,15 @@ class WorldOptions:
             raise InvalidOptionError(f"hours and seed: expected integers >= 0, got {self.hours} and {self.seed}")
 
     def domain(self) -> Domain:
-        """The domain; InvalidOptionError if it cannot be deployed."""
-        domain = get_domain(self.env)
-        if domain.telemetry is None:
+        """The domain, or UnknownNameError."""
+        return get_domain(self.env)
+
+    def telemetry(self) -> Telemetry:
+        """How the domain's state travels; InvalidOptionError if it cannot."""
+        telemetry = self.domain().telemetry
+        if telemetry is None:
             raise InvalidOptionError(f"env: {self.env} has no telemetry and cannot be deployed")
-        return domain
+        return telemetry
 
     def simulator(self) -> TurnSimulator:
         """The plant's simulator, one row at the start of its episode; typed errors for options that do not fit."""

@@ -13,7 +13,6 @@ from marl_sched.comms.messages import kind_of
 if TYPE_CHECKING:
     from marl_sched.comms.options import WorldOptions
     from marl_sched.comms.roster import Roster
-    from marl_sched.domain import Domain
     from marl_sched.simulation import TurnSimulator
 
 SCHEMA = 1
@@ -21,9 +20,9 @@ SCHEMA = 1
 # in time, nobody there to ask. In all but the first the agent idles for this moment.
 DECIDED, CONFLICT, ILLEGAL, LATE, ABSENT = "decided", "conflict", "illegal", "late", "absent"
 
-# Why an agent counts as dead: its liveliness token went (the process ended, froze or was cut off), or it missed too
-# many deadlines in a row.
-GONE, SILENT = "gone", "silent"
+# What happens to agents. Two of these are deaths: its liveliness token went (the process ended, froze or was cut off),
+# or it missed too many deadlines in a row.
+JOINED, GONE, SILENT = "joined", "gone", "silent"
 # `stale` are decisions that answer no open turn: late, repeated, or of an incarnation that the world gave up.
 COUNTS = ("conflicts", "illegal", "missed_deadlines", "stale", "unparsed")
 
@@ -76,13 +75,18 @@ class Books:
         return out
 
 
+def absent(events: list[dict[str, Any]]) -> set[str]:
+    """The agents that died and did not come back."""
+    last = {event["agent"]: event["event"] for event in events if event["event"] in (JOINED, GONE, SILENT)}
+    return {agent for agent, event in last.items() if event != JOINED}
+
+
 def build(
-    options: WorldOptions, domain: Domain, simulator: TurnSimulator, roster: Roster, books: Books, seconds: float
+    options: WorldOptions, simulator: TurnSimulator, roster: Roster, books: Books, seconds: float
 ) -> dict[str, Any]:
     """The report of a run that came to its end, ready for JSON."""
-    telemetry = domain.telemetry
-    assert telemetry is not None  # WorldOptions.domain refuses a domain without
-    series = telemetry.series(simulator)
+    domain = options.domain()
+    series = options.telemetry().series(simulator)
     objectives = {name: float(values[0]) for name, values in simulator.objectives().items()}
     objective = options.objective or domain.objectives[0]
     view = {"kind": options.view, **options.view_options}

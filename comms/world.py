@@ -18,7 +18,7 @@ import numpy as np
 from marl_sched.comms import messages as wire
 from marl_sched.comms.options import WorldOptions
 from marl_sched.comms.process import run_process
-from marl_sched.comms.report import ABSENT, CONFLICT, DECIDED, GONE, ILLEGAL, LATE, SILENT, Books, build
+from marl_sched.comms.report import ABSENT, CONFLICT, DECIDED, GONE, ILLEGAL, JOINED, LATE, SILENT, Books, build
 from marl_sched.comms.roster import Roster
 from marl_sched.comms.session import Event, Transport, hub, settle_port
 from marl_sched.errors import DeploymentError, InvalidMessageError
@@ -37,9 +37,7 @@ class World:
 
     def __init__(self, options: WorldOptions, transport: Transport, progress: Progress | None = None) -> None:
         self.options, self.transport = options, transport
-        self.domain = options.domain()
-        assert self.domain.telemetry is not None  # options.domain() refuses a domain without
-        self.telemetry = self.domain.telemetry
+        self.domain, self.telemetry = options.domain(), options.telemetry()
         self.simulator = options.simulator()
         self.books = Books()
         self.roster = Roster(int(self.simulator.n_agents[0]), options.patience)
@@ -72,7 +70,7 @@ class World:
             self._turn(int(self.simulator.acting[0]))
         seconds = time.monotonic() - started
         self._part()
-        return build(self.options, self.domain, self.simulator, self.roster, self.books, seconds)
+        return build(self.options, self.simulator, self.roster, self.books, seconds)
 
     @property
     def _horizon(self) -> int:
@@ -233,7 +231,7 @@ class World:
             self._fence(hello.agent, hello.incarnation, refusal)
             return
         if not known:
-            self._event(hello.agent, "joined")
+            self._event(hello.agent, JOINED)
         self._put(self._keys.turn(hello.agent), wire.Welcome(agent=hello.agent, incarnation=hello.incarnation))
 
     def _fence(self, agent: int, incarnation: str, reason: str) -> None:

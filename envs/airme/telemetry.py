@@ -146,7 +146,7 @@ class AirmeTelemetry:
 
     def frame(self, simulator: AirmeSimulator) -> bytes:
         """Sizes, padding, usage and view of row 0."""
-        reach, comm, staleness = simulator.view.limits
+        reach, comm, staleness = (min(limit, EVERYWHERE) for limit in simulator.view.limits)
         row = simulator.state.rows[0]
         return _encode(
             Frame(

@@ -6,6 +6,7 @@ import fnmatch
 import queue
 import threading
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -149,6 +150,31 @@ def played_in_process(options: WorldOptions, policies: list[str]) -> dict[str, A
         rewards.append(float(simulator.reward[0]))
     m1 = float(np.float64(simulator.objectives()["profit"][0]))
     return {"decisions": decisions, "rewards": rewards, "M1": m1}
+
+
+@pytest.fixture
+def save_policy(tmp_path: Path) -> Callable[[int], str]:
+    """Writes an untrained HetGAT policy with a seed of its own; its path."""
+
+    def save(seed: int) -> str:
+        torch = pytest.importorskip("torch")
+        from marl_sched.agents.cards import PolicyCard, Sizes
+        from marl_sched.agents.hetgat.checkpoint import save_network
+        from marl_sched.agents.hetgat.network import HetGATNetwork
+
+        graph, sizes = WorldOptions(seed=0).simulator().graph, Sizes(width=4, heads=2, layers=2)
+        with torch.random.fork_rng():
+            torch.manual_seed(seed)
+            network = HetGATNetwork(graph, width=sizes.width, heads=sizes.heads, layers=sizes.layers)
+        card = PolicyCard(
+            domain="airme", objective="profit", view={"kind": "local"}, graph=graph, sizes=sizes,
+            command="none", git_hash="none", seed=seed, scores={},
+        )  # fmt: skip
+        path = tmp_path / f"policy-{seed}.safetensors"
+        save_network(path, network, card)
+        return str(path)
+
+    return save
 
 
 @pytest.fixture

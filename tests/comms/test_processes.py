@@ -57,11 +57,17 @@ def run_module(name: str, options: dict, timeout: float = 60.0) -> subprocess.Co
 
 @pytest.mark.slow
 @needs_proc
-def test_processes_play_the_run_that_is_played_in_process(in_process, tmp_path):
+@pytest.mark.parametrize("learned", [False, True], ids=["rule", "learned"])
+def test_processes_play_the_run_that_is_played_in_process(in_process, save_policy, tmp_path, learned):
     given = world(report=str(tmp_path / "run.json"))
+    policies = [save_policy(1) if learned else "random"] * 6 + ["condition"]
     told = []
-    report = deploy(DeployOptions(world=given, policy="random"), lambda *progress: told.append(progress))
-    reference = in_process(given, ["random"] * 7)
+    report = deploy(
+        DeployOptions(world=given, policy=policies[0], agent_policies={"crew_6": "condition"}),
+        lambda *progress: told.append(progress),
+    )
+    reference = in_process(given, policies)
+    assert [agent["policy"] for agent in report["agents"]] == policies
     assert report["decisions"] == reference["decisions"]
     assert report["rewards"] == reference["rewards"]
     assert report["M1"] == reference["M1"]
@@ -101,7 +107,7 @@ def test_others_go_on_when_an_agent_is_killed_and_the_report_says_so():
 @pytest.mark.slow
 @needs_proc
 def test_frozen_agent_is_given_up_and_comes_back_as_another_incarnation():
-    given = world(hours=2500, deadline=0.5)
+    given = world(hours=2000, deadline=0.5)
     frozen, thawed = [], []
     with Deployment(DeployOptions(world=given, policy="condition")) as deployment:
 

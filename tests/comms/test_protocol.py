@@ -273,13 +273,17 @@ def test_agent_for_a_crew_that_does_not_exist_says_so(make_run):
     assert str(error) == "crew_7 does not exist: run 'run' has crew_0 to crew_6"
 
 
-def test_replaced_policy_changes_nobody_else_before_they_meet(make_run):
-    given = options(hours=60, view_options={"reach": 0, "comm": 0})
-    plain = make_run(given, ["condition"] * 7).play()["decisions"]
-    other = make_run(given, ["condition"] * 3 + ["random"] + ["condition"] * 3).play()["decisions"]
-    assert [d for d in plain if d["agent"] == "crew_3"] != [d for d in other if d["agent"] == "crew_3"]
-    # With reach and comm of 0 crews never meet: nobody sees, hears or wants another's plane.
-    assert [d for d in plain if d["agent"] != "crew_3"] == [d for d in other if d["agent"] != "crew_3"]
+@pytest.mark.parametrize("reach", [0, 1])
+def test_replaced_policy_file_changes_nobody_else_before_they_meet(make_run, save_policy, reach):
+    given = options(hours=30, view_options={"reach": reach, "comm": reach})
+    one, another = save_policy(1), save_policy(2)
+    before = make_run(given, [one] * 7).play()["decisions"]
+    after = make_run(given, [one] * 3 + [another] + [one] * 3).play()["decisions"]
+    first = next(i for i, (old, new) in enumerate(zip(before, after, strict=False)) if old != new)
+    assert before[first]["agent"] == after[first]["agent"] == "crew_3"
+    others = [[d for d in decisions if d["agent"] != "crew_3"] for decisions in (before, after)]
+    # With a reach of 0 nobody ever sees, hears or wants what crew 3 does; with 1 its neighbours soon do.
+    assert (others[0] == others[1]) == (reach == 0)
 
 
 def test_report_counts_messages_and_latencies(make_run):
