@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -23,13 +25,19 @@ class Scheduler(ABC):
         name: as users type it.
         needs: what it uses beyond the acting agent's observation, in words, or "" for nothing;
             printed with every result (for example "failure model").
+        simulator_options: options of the simulator that belong to it, where a user does not choose others.
     """
 
     name: str
     needs: str = ""
+    simulator_options: Mapping[str, Any] = MappingProxyType({})
 
     def start(self, simulator: TurnSimulator, rows: np.ndarray) -> None:
         """Called after `rows`, bool (B,), began a new episode; planners make their plans here."""
+
+    def per_round(self) -> dict[str, np.ndarray]:
+        """What the scheduler counted of itself, such as messages: name -> float64 (B, rounds); mostly nothing."""
+        return {}
 
     @abstractmethod
     def decide(self, simulator: TurnSimulator) -> np.ndarray:

@@ -29,6 +29,7 @@ from marl_sched.statistics import Summary, paired_difference, percent_gain, summ
 SCHEMA = 1
 # Keys of Domain.extras: the name of the reference scheduler, what the horizon counts, which M1 is the better one.
 REFERENCE, UNIT, BETTER = "reference", "unit", "better"
+EXACT = "exact"  # the scheduler that the others' gap is taken to where it plays
 SHARE_EVERY = 8  # turns between two readings of the visible share
 _CHUNK_CELLS = 512 * 41 * 16  # pairs of target and agent in flight: 512 rows of a small AirME fleet
 
@@ -94,7 +95,7 @@ class Scores:
         measures: the simulator's `objectives()` at the end of each episode, name -> float64 (I, E).
         visible_share: share of the graph that acting agents saw, mean over turns.
         seconds: wall time of all episodes, simulation included.
-        per_round: the simulator's `per_round()`, name -> float64 (I, E, rounds); empty where there are no rounds.
+        per_round: the simulator's and the scheduler's `per_round()`, name -> float64 (I, E, rounds).
         needs: what the scheduler uses beyond the acting agent's observation, "" for nothing.
     """
 
@@ -127,7 +128,8 @@ def evaluate_scheduler(
     per_round: list[dict[str, np.ndarray]] = []
     shares, turns = 0.0, 0
     for rows in _chunks(total, max_rows or _rows_that_fit(domain, instances, settings)):
-        simulator = settings.simulator(domain, [instances[row // settings.episodes] for row in rows])
+        chosen = [instances[row // settings.episodes] for row in rows]
+        simulator = settings.simulator(domain, chosen, **_own_options(scheduler, settings))
         simulator.reset(seed=settings.seed, episodes=[row % settings.episodes for row in rows])
         scheduler.start(simulator, np.ones(simulator.batch, np.bool_))
         for turn in count():
@@ -141,7 +143,7 @@ def evaluate_scheduler(
                     progress((rows.start + len(rows) * _played(simulator)) / total)
             simulator.step(scheduler.decide(simulator))
         measures.append(simulator.objectives())
-        per_round.append(simulator.per_round())
+        per_round.append({**simulator.per_round(), **scheduler.per_round()})
     return Scores(
         measures=_joined(measures, len(instances)),
         per_round=_joined(per_round, len(instances)),
@@ -149,6 +151,11 @@ def evaluate_scheduler(
         seconds=time.perf_counter() - started,
         needs=scheduler.needs,
     )
+
+
+def _own_options(scheduler: Scheduler, settings: Settings) -> dict[str, Any]:
+    """The simulator's options that belong to a scheduler, where the settings do not choose others."""
+    return {name: value for name, value in scheduler.simulator_options.items() if name not in settings.options}
 
 
 def _joined(parts: list[dict[str, np.ndarray]], n_instances: int) -> dict[str, np.ndarray]:
@@ -238,6 +245,9 @@ class Table:
             row[name] = row["M1"] if name == objective else self._summary(values).as_json()
         for name, values in scores.per_round.items():
             row[name] = {"mean": _mean(values), **row.get(name, {}), "per_round": _by_round(values)}
+        if EXACT in self.scores:
+            gap = percent_gain(m1, self.scores[EXACT].measures[objective])
+            row["gap_to_exact"] = self._summary(gap).as_json()
         difference = paired_difference(m1, self.baseline[1].measures[objective])
         row["difference"] = {"to": self.baseline[0], **difference.as_json()}
         row["visible_share"] = scores.visible_share

@@ -12,6 +12,7 @@ from marl_sched.agents.murse.snapshot import estimated_round, remaining_round
 from marl_sched.envs.murse.instance import MurseInstance
 from marl_sched.envs.murse.simulator import MurseSimulator
 from marl_sched.errors import InvalidOptionError
+from marl_sched.simulation import TurnSimulator
 
 _TIME_LIMIT = 10.0  # seconds per round
 _ROLLING_TIME_LIMIT = 2.0  # seconds per new plan
@@ -24,7 +25,7 @@ class ExactScheduler(PlanningScheduler):
     not enough, is played by EDF; `solutions` says which.
 
     Attributes:
-        solutions: (row, round) -> what the solver found.
+        solutions: (row, round) -> what the solver found, of the running episodes.
     """
 
     name = "exact"
@@ -35,6 +36,13 @@ class ExactScheduler(PlanningScheduler):
             raise InvalidOptionError(f"{self.name}: time_limit: expected seconds > 0, got {time_limit}")
         self._time_limit = time_limit
         self.solutions: dict[tuple[int, int], Solution] = {}
+
+    def start(self, simulator: TurnSimulator, rows: np.ndarray) -> None:
+        """Forget the rows' plans and solutions."""
+        super().start(simulator, rows)
+        self.solutions = {
+            key: found for key, found in self.solutions.items() if key[0] < len(rows) and not rows[key[0]]
+        }
 
     def plan(self, simulator: MurseSimulator, row: int) -> Plan:
         """The solution of the round on estimates, everything as early as its order allows."""

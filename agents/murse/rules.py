@@ -1,12 +1,13 @@
 """Priority rules for MuRSE: each picks a task for the agent that is free, from what that agent sees.
 
 A rule chooses among the tasks that its agent can start at once and waits when there is none. Which of several
-free agents chooses first is the simulator's picking strategy; a rule that belongs to one says so in `picking`.
+free agents chooses first is the simulator's picking strategy; a rule that belongs to one names it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from types import MappingProxyType
 
 import msgspec
 import numpy as np
@@ -77,7 +78,7 @@ class EdfPublished(Scheduler):
 
     name = "edf-published"
     needs = "all durations and waits"
-    picking = "mean_unscheduled"
+    simulator_options = MappingProxyType({"picking": "mean_unscheduled"})
 
     def __init__(self) -> None:
         self._rounds, self._finish = np.empty(0, np.int64), np.empty((0, 0, 0))
@@ -133,6 +134,10 @@ class FirstClaim(ObservationScheduler):
     def choose(self, observation: Observation, uniform: np.ndarray) -> np.ndarray:
         """Targets int64 (B,), ties to the lower index; `uniform` is not used."""
         return best_target(-np.asarray(observation["task"], np.float64)[..., EARLIEST_FINISH], legal_tasks(observation))
+
+    def per_round(self) -> dict[str, np.ndarray]:
+        """Messages and bytes."""
+        return self.traffic.per_round()
 
     def decide(self, simulator: TurnSimulator) -> np.ndarray:
         """Targets int64 (B,), each claim counted."""

@@ -25,3 +25,7 @@ class Traffic:
         now = int(simulator.state.rows["round"][row])
         self.messages[row, now] += messages
         self.bytes[row, now] += size
+
+    def per_round(self) -> dict[str, np.ndarray]:
+        """`messages` and `bytes`, float64 (B, R)."""
+        return {"messages": self.messages.astype(np.float64), "bytes": self.bytes.astype(np.float64)}

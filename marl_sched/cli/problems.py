@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from marl_sched.cli import options
+from marl_sched.errors import InvalidOptionError
+
+if TYPE_CHECKING:
+    from marl_sched.domain import Domain
 
 
 def add_to(app: typer.Typer) -> None:
@@ -21,14 +26,26 @@ def generate(
     scale: options.Scale = "small",
     count: Annotated[int, typer.Option("--count", min=1, help="How many instances.")] = 1,
     seed: options.Seed = 0,
+    feasible: Annotated[
+        bool, typer.Option("--feasible", help="murse: draw until the exact solver finds a feasible schedule.")
+    ] = False,
 ) -> None:
     """Draw problem instances and write each to a JSON file of its own."""
     from marl_sched.domain import get_domain
 
-    domain = get_domain(env)
+    domain = _solvable(get_domain(env)) if feasible else get_domain(env)
     domain.require_scale(scale)
     options.check_folder(out)
     digits = len(str(count - 1))
     for i, instance in enumerate(domain.instances(scale, count, seed)):
         instance.save(out / f"{env}-{scale}-{seed}-{i:0{digits}}.json")
     typer.echo(f"{count} {scale} {env} instances in {out}")
+
+
+def _solvable(domain: Domain) -> Domain:
+    """A domain that generates only instances that the exact solver solves; InvalidOptionError if it has none."""
+    if domain.name != "murse":
+        raise InvalidOptionError(f"--feasible: the environment {domain.name!r} has no infeasible instances")
+    from marl_sched.agents.murse.optimal import is_feasible
+
+    return replace(domain, generate=lambda scale, rng: domain.generate(scale, rng, is_feasible))  # type: ignore[call-arg]  # MuRSE's
