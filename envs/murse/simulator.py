@@ -215,36 +215,29 @@ class MurseSimulator(TurnSimulator):
         return free[np.argsort(keys, kind="stable")]
 
     def objectives(self) -> dict[str, np.ndarray]:
-        """Means over the rounds that have ended, float64 (B,); 0 before the first has.
+        """Means over the rounds that have ended, float64 (B,), conflicts summed; 0 before the first has ended.
 
         makespan and weighted are adjusted: an infeasible round counts with the worst case, the largest sum of one
-        agent's durations over all tasks (times the sum of weights). Conflicts are summed.
+        agent's durations over all tasks (times the sum of weights).
         """
-        state = self.state
-        ended = np.arange(self.horizon) < state.rows["round"][:, None]
-        n = np.maximum(ended.sum(axis=1), 1)
-        rounds, weights = state.rounds, state.tasks["weight"].sum(axis=1)[:, None]
-        feasible = rounds["feasible"] & ended
-        measures = {
-            "makespan": np.where(feasible, rounds["makespan"], rounds["worst"]),
-            "weighted": np.where(feasible, rounds["weighted"], rounds["worst"] * weights),
-            "feasible": feasible,
-        }
-        means = {name: np.where(ended, values, 0).sum(axis=1) / n for name, values in measures.items()}
-        return means | {"conflicts": np.where(ended, rounds["conflicts"], 0).sum(axis=1).astype(np.float64)}
+        rounds = self.per_round()
+        ended = np.maximum(self.state.rows["round"], 1)
+        sums = {name: np.nansum(rounds[name], axis=1) for name in ("makespan", "weighted", "feasible", "conflicts")}
+        return {name: total if name == "conflicts" else total / ended for name, total in sums.items()}
 
     def per_round(self) -> dict[str, np.ndarray]:
-        """Measures of each round, float64 (B, rounds), NaN before it has ended.
+        """Measures of each round, name -> float64 (B, horizon), NaN where a round has not ended.
 
-        feasible, makespan (adjusted, as in `objectives`), makespan_feasible (NaN where infeasible), conflicts.
+        As `objectives`; `makespan_feasible` is NaN in infeasible rounds too.
         """
-        rounds = self.state.rounds
+        rounds, weights = self.state.rounds, self.state.tasks["weight"].sum(axis=1)[:, None]
         ended = np.arange(self.horizon) < self.state.rows["round"][:, None]
         feasible = rounds["feasible"]
         measures = {
             "feasible": feasible,
             "makespan": np.where(feasible, rounds["makespan"], rounds["worst"]),
             "makespan_feasible": np.where(feasible, rounds["makespan"], np.nan),
+            "weighted": np.where(feasible, rounds["weighted"], rounds["worst"] * weights),
             "conflicts": rounds["conflicts"],
         }
         return {name: np.where(ended, values, np.nan) for name, values in measures.items()}

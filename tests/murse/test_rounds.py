@@ -167,6 +167,18 @@ def test_rounds_follow_each_other_in_time():
     assert MurseSimulator([three_tasks(n_rounds=2)], horizon=1).state.rows["n_rounds"][0] == 1
 
 
+def test_measures_of_each_round_count_an_infeasible_one_with_its_worst_case():
+    simulator = MurseSimulator([three_tasks(n_rounds=3)], horizon=4)
+    played(simulator, [1, 2, 3, 0, 0])
+    rounds = simulator.per_round()
+    np.testing.assert_array_equal(rounds["feasible"][0], [1.0, 0.0, np.nan, np.nan])
+    np.testing.assert_array_equal(rounds["makespan"][0], [11.0, 9.0, np.nan, np.nan])
+    np.testing.assert_array_equal(rounds["makespan_feasible"][0], [11.0, np.nan, np.nan, np.nan])
+    np.testing.assert_array_equal(rounds["weighted"][0], [22.0, 27.0, np.nan, np.nan])
+    assert simulator.objectives()["makespan"][0] == 10.0
+    assert simulator.objectives()["feasible"][0] == 0.5
+
+
 def test_decision_rewards_sum_to_the_makespan():
     simulator = MurseSimulator([three_tasks()], rewards="decision")
     rewards = [float(played(simulator, [target]).reward[0]) for target in (1, 2, 3)]
