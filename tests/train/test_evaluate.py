@@ -220,3 +220,38 @@ def test_rounds_are_told_one_by_one_and_failures_count():
         assert row["makespan_feasible"] == {"mean": None, "per_round": [None, None, None]}
     else:
         assert row["makespan_feasible"]["mean"] < row["makespan"]["mean"]
+
+
+def test_the_gap_to_the_exact_solver_is_in_percent_of_its_score():
+    murse = get_domain("murse")
+    scores = {
+        "exact": Scores(measures={"makespan": np.array([[50.0], [80.0]])}, visible_share=1.0, seconds=1.0),
+        "quick": Scores(measures={"makespan": np.array([[60.0], [80.0]])}, visible_share=1.0, seconds=1.0),
+    }
+    table = Table(
+        domain=murse,
+        settings=settings(objective="makespan"),
+        n_instances=2,
+        scores=scores,
+        reference=None,
+        baseline=("exact", scores["exact"]),
+    ).as_json()
+    assert table["schedulers"]["quick"]["gap_to_exact"]["mean"] == pytest.approx(10.0)
+    assert table["schedulers"]["exact"]["gap_to_exact"]["mean"] == 0.0
+
+
+class Talkative(type(RULES["random"]())):
+    """Says one word in every round of every row."""
+
+    def start(self, simulator, rows):
+        self._said = np.ones((simulator.batch, simulator.horizon))
+
+    def per_round(self):
+        return {"messages": self._said}
+
+
+def test_what_a_scheduler_counts_of_itself_is_told_by_round():
+    murse = get_domain("murse")
+    few = Settings(episodes=2, seed=1, horizon=3, scale="small")
+    table = evaluate(murse, {"talkative": Talkative()}, murse.instances("small", 2, 1), few).as_json()
+    assert table["schedulers"]["talkative"]["messages"] == {"mean": 1.0, "per_round": [1.0, 1.0, 1.0]}
