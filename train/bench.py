@@ -133,7 +133,7 @@ def policy_milliseconds(domain: Domain, scale: str, repeats: int) -> float:
     return 1e3 / _POLICY_DECISIONS * _best(repeats, simulator.reset, play)
 
 
-def _best(repeats: int, prepare: Callable[[], Any], play: Callable[[], None]) -> float:
+def _best(repeats: int, prepare: Callable[[], Any], play: Callable[[], Any]) -> float:
     """The least CPU seconds that `play` took, after one run that does not count: it compiles and fills caches."""
     seconds = []
     for _ in range(repeats + 1):
