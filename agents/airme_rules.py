@@ -8,10 +8,11 @@ dissertation puts it. Rules may recall flying planes.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 
+from marl_sched.agents.airme_bound.index import IndexScheduler
 from marl_sched.agents.base import ObservationScheduler, best_target
 from marl_sched.envs.airme.aircraft import PUBLISHED_TYPES, AircraftType, failure_table
 from marl_sched.envs.airme.graph import graph_spec
@@ -152,4 +153,6 @@ RULES: dict[str, Callable[[], ObservationScheduler]] = {
     "periodic": PeriodicRule,
     "model-based": model_based,
     "preventive-first": preventive_first,
+    "index": IndexScheduler,
+    "index-without-clock": partial(IndexScheduler, clock=False),
 }
