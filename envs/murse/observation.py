@@ -41,7 +41,7 @@ from marl_sched.envs.murse.views import Sight, look, standpoint
 from marl_sched.temporal_network import UNBOUNDED, close
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def observe(state: State, rules: Rules, agents: np.ndarray, sensing: float, comm: float, out: Arrays) -> None:
     """Write what each row's agent, int64 (B,), sees; a negative agent sees nothing."""
     for b in range(len(agents)):
@@ -62,7 +62,7 @@ def observe(state: State, rules: Rules, agents: np.ndarray, sensing: float, comm
             offer(state, b, sight, out)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def clear(out: Arrays, b: int) -> None:
     """Forget what a row held."""
     out.task[b] = 0.0
@@ -89,7 +89,7 @@ def clear(out: Arrays, b: int) -> None:
     out.visible_share[b] = 0.0
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def see_agents(state: State, b: int, viewer: int, sight: Sight, out: Arrays) -> None:
     """Agents within hearing, when they will be free and how many tasks they have."""
     row = state.rows[b]
@@ -112,7 +112,7 @@ def see_agents(state: State, b: int, viewer: int, sight: Sight, out: Arrays) -> 
             out.agent[b, state.tasks[b, task].agent, 5] += 1 / row.n_tasks
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def see_tasks(state: State, b: int, viewer: int, sight: Sight, out: Arrays) -> None:
     """The placeholders and the tasks in sight, each as the viewer knows it."""
     row, tasks, lags, near = state.rows[b], state.tasks[b], state.lags[b], state.near[b]
@@ -136,7 +136,7 @@ def see_tasks(state: State, b: int, viewer: int, sight: Sight, out: Arrays) -> N
         out.task_mask[b, task + 1] = 1
         describe_task(features, job, row.high, row.clock, x, y)
         describe_durations(features, pairs, viewer, sight.heard, row.high)
-        describe_waits(features, task, n, lags, taken[:count], sight.seen)
+        describe_waits(out.task[b], task, lags, taken[:count], sight.seen[:n])
         if sight.known[task]:
             describe_commitment(features, sight.start[task] - row.clock, sight.finish[task] - row.clock, row.high)
             features[MINE] = job.agent == viewer
@@ -151,7 +151,7 @@ def see_tasks(state: State, b: int, viewer: int, sight: Sight, out: Arrays) -> N
     out.visible_share[b] = visible / n
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def describe_task(features: np.ndarray, job: Record, unit: int, now: int, x: float, y: float) -> None:
     """What a task is: its weight, its deadline from now, and how far it lies from (x, y)."""
     features[DISTANCE_TO] = np.hypot(job.x - x, job.y - y) / 10
@@ -161,7 +161,7 @@ def describe_task(features: np.ndarray, job: Record, unit: int, now: int, x: flo
         features[DEADLINE] = (job.deadline - now) / unit
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def describe_durations(features: np.ndarray, pairs: np.ndarray, viewer: int, heard: np.ndarray, unit: int) -> None:
     """Estimates for the viewer, and their statistics over the eligible agents within hearing (section 4.3.1)."""
     own = pairs[viewer]
@@ -184,22 +184,24 @@ def describe_durations(features: np.ndarray, pairs: np.ndarray, viewer: int, hea
         features[STD_DURATION] = np.sqrt(max(squares / count - (total / count) ** 2, 0.0))
 
 
-@njit(cache=True)
-def describe_waits(
-    features: np.ndarray, task: int, n_tasks: int, lags: np.ndarray, taken: np.ndarray, seen: np.ndarray
-) -> None:
-    """For how many tasks that are not in `taken`, int64 (k,), a task waits, and how many in sight wait for it."""
-    unheeded = waited_for = 0
-    for other in range(n_tasks):
-        unheeded += lags[task, other] >= 0
-        waited_for += seen[other] and lags[other, task] >= 0
+@njit(cache=True, error_model="numpy")
+def describe_waits(features: np.ndarray, task: int, lags: np.ndarray, taken: np.ndarray, seen: np.ndarray) -> None:
+    """Count in float32 (slots, F) for how many tasks that are not in `taken`, int64 (k,), a task in sight waits.
+
+    Those in sight, bool (n,), that it waits for are told that one more waits for them.
+    """
+    unheeded = 0
+    for other in range(len(seen)):
+        if lags[task, other] >= 0:
+            unheeded += 1
+            if seen[other]:
+                features[other + 1, WAITED_FOR] += 1.0
     for other in taken:
         unheeded -= lags[task, other] >= 0
-    features[WAITS_UNHEEDED] = unheeded
-    features[WAITED_FOR] = waited_for
+    features[task + 1, WAITS_UNHEEDED] = unheeded
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def describe_commitment(features: np.ndarray, start: int, finish: int, unit: int) -> None:
     """A taken task's believed times from now."""
     features[FINISHED] = finish <= 0
@@ -208,7 +210,7 @@ def describe_commitment(features: np.ndarray, start: int, finish: int, unit: int
     features[FINISH] = finish / unit
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def see_durations(state: State, b: int, sight: Sight, out: Arrays) -> None:
     """Edges between unscheduled tasks and eligible agents, with estimate and spread, both ways."""
     row = state.rows[b]
@@ -227,7 +229,7 @@ def see_durations(state: State, b: int, sight: Sight, out: Arrays) -> None:
                 out.use_time_attributes[b, task + 1, agent, 1] = spread
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def see_locations(state: State, b: int, sight: Sight, out: Arrays) -> None:
     """Locations of tasks in sight, and which of them lie too close for work at the same time."""
     row = state.rows[b]
@@ -245,7 +247,7 @@ def see_locations(state: State, b: int, sight: Sight, out: Arrays) -> None:
                 out.near[b, place, state.tasks[b, other].place] = 1
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def see_network(state: State, b: int, sight: Sight, out: Arrays) -> None:
     """Edges of the temporal network over the tasks in sight, those taken in their agents' order."""
     row = state.rows[b]
@@ -273,7 +275,7 @@ def see_network(state: State, b: int, sight: Sight, out: Arrays) -> None:
         out.aug_attributes[b, :, :, 0] = bounds[:, :, 0].T
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def visible_network(
     seen: np.ndarray, tasks: np.ndarray, pairs: np.ndarray, lags: np.ndarray, sight: Sight
 ) -> np.ndarray:
@@ -309,7 +311,7 @@ def visible_network(
     return simplified_network(durations, inner, deadlines, horizon)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def offer(state: State, b: int, sight: Sight, out: Arrays) -> None:
     """The targets that are legal as far as the viewer knows: free, eligible, and behind all that they wait for."""
     for slot in range(1, state.rows[b].n_tasks + 1):
@@ -319,7 +321,7 @@ def offer(state: State, b: int, sight: Sight, out: Arrays) -> None:
             out.action_mask[b, slot] = 1
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def summarise(state: State, b: int, sight: Sight, out: Arrays) -> None:
     """The state node's features and the edges from the viewer to its decisions, from visible nodes alone."""
     row, features = state.rows[b], out.state[b]
