@@ -69,16 +69,14 @@ class Deployment:
         warm_up(options)
         self.endpoint = settle_port(options.world.listen)
         self.children: dict[str, Child] = {}
-        self.phase, self.moment, self.horizon = "starting", 0, int(options.world.hours)
+        self.phase, self.moment, self.horizon = "starting", 0, options.world.hours
 
     def __enter__(self) -> Deployment:
         """Start all processes."""
         self._folder = tempfile.TemporaryDirectory(prefix="marl_sched-")
         self._report = Path(self._folder.name) / "report.json"
         try:
-            world = replace(self.options.world, listen=self.endpoint, report=str(self._report))
-            reader = self._start(WORLD, "marl_sched.comms.world", asdict(world))
-            threading.Thread(target=self._follow, args=(reader,), daemon=True).start()
+            self.start_world()
             for agent in range(len(self.policies)):
                 self.start_agent(agent)
         except BaseException:
@@ -89,6 +87,14 @@ class Deployment:
     def __exit__(self, *exc: object) -> None:
         """End all processes."""
         self.close()
+
+    def start_world(self) -> None:
+        """Start the world's process; again, if it has died, and then the run begins anew with the same agents."""
+        self.phase, self.moment = "starting", 0
+        options = replace(self.options.world, listen=self.endpoint, report=str(self._report))
+        self._start(WORLD, "marl_sched.comms.world", asdict(options))
+        lines = self.children[WORLD].process.stdout
+        threading.Thread(target=self._follow, args=(lines,), daemon=True).start()
 
     def start_agent(self, agent: int) -> None:
         """Start an agent's process; again, if it has died."""
@@ -102,7 +108,7 @@ class Deployment:
         name = self.options.world.domain().agent_name(agent)
         self._start(name, "marl_sched.comms.agent", asdict(options))
 
-    def _start(self, name: str, module: str, options: dict[str, Any]) -> Any:
+    def _start(self, name: str, module: str, options: dict[str, Any]) -> None:
         errors = Path(self._folder.name) / f"{name}.{time.monotonic_ns()}.stderr"
         with errors.open("w") as stderr:
             process = subprocess.Popen(
@@ -115,7 +121,6 @@ class Deployment:
                 start_new_session=True,  # Ctrl-C reaches this process alone, which then ends the others
             )
         self.children[name] = Child(name, process, errors)
-        return process.stdout
 
     def _follow(self, lines: Any) -> None:
         for line in lines:

@@ -24,7 +24,7 @@ DECIDED, CONFLICT, ILLEGAL, LATE, ABSENT = "decided", "conflict", "illegal", "la
 # or it missed too many deadlines in a row.
 JOINED, GONE, SILENT = "joined", "gone", "silent"
 # `stale` are decisions that answer no open turn: late, repeated, or of an incarnation that the world gave up.
-COUNTS = ("conflicts", "illegal", "missed_deadlines", "stale", "unparsed")
+COUNTS = ("conflicts", "illegal", "missed_deadlines", "stale", "fenced", "unparsed")
 
 
 @dataclass
