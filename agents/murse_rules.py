@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from marl_sched.agents.base import Scheduler
+from marl_sched.agents.murse.genetic import GeneticEdf
+from marl_sched.agents.murse.negotiated import Cbba, Tessi
 from marl_sched.agents.murse.optimal import ExactScheduler, RollingScheduler
 from marl_sched.agents.murse.rules import EdfPublished, FirstClaim, RandomRule, edf, hctf
+from marl_sched.agents.murse.tercio import Tercio
 
 RULES: dict[str, Callable[..., Scheduler]] = {
     "random": RandomRule,
@@ -14,6 +17,10 @@ RULES: dict[str, Callable[..., Scheduler]] = {
     "edf-published": EdfPublished,
     "hctf": hctf,
     "first-claim": FirstClaim,
+    "tessi": Tessi,
+    "cbba": Cbba,
+    "genetic-edf": GeneticEdf,
+    "tercio": Tercio,
     "exact": ExactScheduler,
     "exact-rolling": RollingScheduler,
 }

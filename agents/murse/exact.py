@@ -57,7 +57,7 @@ def solve(problem: Round, *, objective: str = "makespan", time_limit: float = 10
     require("objective of murse", objective, OBJECTIVES)
     if not time_limit > 0:
         raise InvalidOptionError(f"exact: time_limit: expected seconds > 0, got {time_limit}")
-    cp = _ortools()
+    cp = ortools()
     model = _Model(cp, problem)
     model.minimise(objective)
     solver = cp.CpSolver()
@@ -179,9 +179,10 @@ class _Model:
         )
 
 
-def _ortools() -> Any:
+def ortools() -> Any:
+    """The CP-SAT module; MarlSchedError without OR-Tools."""
     try:
         from ortools.sat.python import cp_model
     except ModuleNotFoundError as error:
-        raise MarlSchedError("exact: expected OR-Tools to be installed: pip install 'marl-sched[solvers]'") from error
+        raise MarlSchedError("solver: expected OR-Tools to be installed: pip install 'marl-sched[solvers]'") from error
     return cp_model

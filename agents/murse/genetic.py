@@ -1,0 +1,83 @@
+"""GeneticEDF: EDF's schedule bettered by mutation and selection (section 5.7.2)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from marl_sched.agents.murse.following import PlanningScheduler
+from marl_sched.agents.murse.list_schedule import edf_schedule
+from marl_sched.agents.murse.problem import Plan, Round, timed
+from marl_sched.agents.murse.snapshot import estimated_round
+from marl_sched.envs.murse.simulator import MurseSimulator
+from marl_sched.envs.murse.timetable import time_batch
+from marl_sched.errors import InvalidOptionError
+
+
+class GeneticEdf(PlanningScheduler):
+    """Improves EDF's schedule of every round on estimated durations; see `evolve` for the options."""
+
+    name = "genetic-edf"
+
+    def __init__(self, generations: int = 10, baselines: int = 90, mutations: int = 10) -> None:
+        super().__init__()
+        for name, value in (("generations", generations), ("baselines", baselines), ("mutations", mutations)):
+            if value < 1:
+                raise InvalidOptionError(f"{self.name}: {name}: expected an integer >= 1, got {value}")
+        self._options = generations, baselines, mutations
+
+    def plan(self, simulator: MurseSimulator, row: int) -> Plan:
+        """The best schedule found; its randomness is that of the row's episode and round."""
+        rows = simulator.state.rows
+        rng = np.random.default_rng([int(rows["episode"][row]), int(rows["round"][row])])
+        return evolve(estimated_round(simulator, row), rng, *self._options)
+
+
+def evolve(problem: Round, rng: np.random.Generator, generations: int, baselines: int, mutations: int) -> Plan:
+    """Start from EDF; in each of `generations` add `mutations` schedules in which a task changes its agent and as
+    many in which two tasks change places, of baselines drawn at random, and keep the best `baselines`.
+
+    Feasible schedules come first, then those with the smaller makespan, ties to the older one.
+    """
+    first = edf_schedule(problem)
+    orders, agents = first.tasks[None], first.agents[None]
+    costs = np.array([_cost(problem, first)])
+    for _ in range(generations):
+        parents = rng.integers(len(orders), size=2 * mutations)
+        new_orders, new_agents = orders[parents], agents[parents]
+        for k in range(mutations):
+            reallocate(problem, new_orders[k], new_agents[k], rng)
+            swap_order(new_orders[mutations + k], new_agents[mutations + k], rng)
+        _, _, makespans, feasible = time_batch(
+            new_orders, new_agents, problem.durations, problem.lags, problem.near, problem.deadlines
+        )
+        new_costs = np.where(feasible, makespans, makespans + _penalty(problem))
+        orders, agents = np.concatenate([orders, new_orders]), np.concatenate([agents, new_agents])
+        costs = np.concatenate([costs, new_costs])
+        best = np.argsort(costs, kind="stable")[:baselines]
+        orders, agents, costs = orders[best], agents[best], costs[best]
+    best_plan = timed(problem, orders[0], agents[0])
+    if not best_plan.feasible:
+        return first  # the mutants may not even be consistent, EDF's order always is
+    by_start = np.argsort(best_plan.starts[best_plan.tasks], kind="stable")
+    return timed(problem, best_plan.tasks[by_start], best_plan.agents[by_start])
+
+
+def reallocate(problem: Round, order: np.ndarray, agents: np.ndarray, rng: np.random.Generator) -> None:
+    """Give a task, drawn at random, to an eligible agent drawn at random; agents int64 (N,) in dispatch order."""
+    place = rng.integers(len(order))
+    agents[place] = rng.choice(np.flatnonzero(problem.eligible[order[place]]))
+
+
+def swap_order(order: np.ndarray, agents: np.ndarray, rng: np.random.Generator) -> None:
+    """Let two pairs, drawn at random, change places in the dispatch order, int64 (N,)."""
+    a, b = rng.integers(len(order), size=2)
+    order[[a, b]], agents[[a, b]] = order[[b, a]], agents[[b, a]]
+
+
+def _cost(problem: Round, plan: Plan) -> int:
+    return plan.makespan + (0 if plan.feasible else _penalty(problem))
+
+
+def _penalty(problem: Round) -> int:
+    """More than any feasible makespan."""
+    return int(problem.durations.sum() + np.maximum(problem.lags, 0).sum() + 1)

@@ -1,0 +1,123 @@
+"""Schedulers whose agents share out a round's tasks by messages before it begins, then each follow their own list."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+
+import numpy as np
+
+from marl_sched.agents.auctions.cbba import CbbaBidder
+from marl_sched.agents.auctions.diary import UNKNOWN, Diary
+from marl_sched.agents.auctions.network import Bidder, hearing, negotiate
+from marl_sched.agents.auctions.tessi import TessiBidder
+from marl_sched.agents.base import Scheduler
+from marl_sched.agents.murse.snapshot import as_murse, estimated_round
+from marl_sched.agents.murse.traffic import Traffic
+from marl_sched.envs.murse.simulator import MurseSimulator
+from marl_sched.envs.murse.state import NOBODY
+from marl_sched.errors import InvalidOptionError
+from marl_sched.simulation import TurnSimulator
+
+_TURNS_PER_TASK = 100
+
+
+class NegotiatingScheduler(Scheduler):
+    """Negotiates on estimated durations at the beginning of every round; `bidder` is what a subclass adds.
+
+    Before a round agents hear those within `radius` of their stations (marl_sched.agents.auctions.network), None:
+    as far as the simulator's view lets them, so everybody under the full view. Afterwards they say nothing more:
+    an agent comes to a task that another one has taken if it did not hear of it, which is a conflict, and then
+    crosses it off its list.
+
+    Attributes:
+        traffic: messages and bytes by row and round.
+    """
+
+    needs = "all durations, waits, deadlines and places"
+
+    def __init__(self, radius: float | None = None) -> None:
+        if radius is not None and not radius >= 0:
+            raise InvalidOptionError(f"{self.name}: radius: expected a number >= 0, got {radius}")
+        self._radius = radius
+        self.traffic = Traffic()
+        self._rounds = np.empty(0, np.int64)
+        self._diaries: list[list[Diary]] = []
+
+    @abstractmethod
+    def bidder(self, diary: Diary, n_agents: int) -> Bidder:
+        """An agent's side of the negotiation."""
+
+    def per_round(self) -> dict[str, np.ndarray]:
+        """Messages and bytes."""
+        return self.traffic.per_round()
+
+    def start(self, simulator: TurnSimulator, rows: np.ndarray) -> None:
+        """Forget what the rows' agents agreed on."""
+        self.traffic.restart(as_murse(simulator), rows)
+        if len(self._rounds) != simulator.batch:
+            self._rounds, self._diaries = np.full(simulator.batch, -1), [[] for _ in range(simulator.batch)]
+        self._rounds[rows] = -1
+
+    def decide(self, simulator: TurnSimulator) -> np.ndarray:
+        """Targets int64 (B,): each acting agent's next task by its own diary."""
+        murse, targets = as_murse(simulator), np.zeros(simulator.batch, np.int64)
+        rounds = murse.state.rows["round"]
+        for row in np.flatnonzero(murse.acting != NOBODY).tolist():
+            if self._rounds[row] != rounds[row]:
+                self._negotiate(murse, row)
+                self._rounds[row] = rounds[row]
+            targets[row] = next_own(murse, row, self._diaries[row][int(murse.acting[row])])
+        return targets
+
+    def _negotiate(self, simulator: MurseSimulator, row: int) -> None:
+        problem, instance = estimated_round(simulator, row), simulator.instances[row]
+        diaries = [
+            Diary(agent, problem.durations, problem.lags, problem.near, problem.deadlines)
+            for agent in range(problem.n_agents)
+        ]
+        bidders = [self.bidder(diary, problem.n_agents) for diary in diaries]
+        radius = simulator.view.limits[1] if self._radius is None else self._radius
+        hears = hearing(problem.n_agents, instance.map_width, radius)
+        talk = negotiate(bidders, hears, _TURNS_PER_TASK * problem.n_tasks)
+        self.traffic.add(simulator, row, talk.messages, talk.bytes)
+        self._diaries[row] = diaries
+
+
+def next_own(simulator: MurseSimulator, row: int, diary: Diary) -> int:
+    """The target of the next task on an agent's own list, or 0 while it has to wait.
+
+    It goes for a task that is taken if it has not heard of that. It waits until what the task waits for and near
+    tasks that it believes to come before have been dispatched.
+    """
+    agent, tasks = diary.agent, simulator.state.tasks
+    holders = tasks["agent"][row]
+    told = simulator.state.told[row, agent, :, 1] >= 0
+    for task in diary.path:
+        if holders[task] == agent or told[task]:
+            continue
+        if holders[task] != NOBODY:
+            return task + 1
+        before = (diary.starts != UNKNOWN) & (diary.starts < diary.starts[task]) & diary.near[task]
+        open_before = before & (holders[: len(before)] == NOBODY)
+        return 0 if open_before.any() or not simulator.dispatchable(row, task, agent) else task + 1
+    return 0
+
+
+class Tessi(NegotiatingScheduler):
+    """Sequential single-item auctions with a temporal-network test, see marl_sched.agents.auctions.tessi."""
+
+    name = "tessi"
+
+    def bidder(self, diary: Diary, n_agents: int) -> Bidder:
+        """A bidder of TeSSI."""
+        return TessiBidder(diary)
+
+
+class Cbba(NegotiatingScheduler):
+    """The consensus-based bundle algorithm with a temporal-network test, see marl_sched.agents.auctions.cbba."""
+
+    name = "cbba"
+
+    def bidder(self, diary: Diary, n_agents: int) -> Bidder:
+        """A bidder of CBBA."""
+        return CbbaBidder(diary, n_agents)
