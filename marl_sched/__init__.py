@@ -1,8 +1,8 @@
 """Schedulers that decide for themselves: aircraft maintenance (AirME) and human-robot teams (MuRSE).
 
-    from marl_sched import airme_v0
+    import marl_sched
 
-    env = airme_v0.env()                                    # PettingZoo AEC
+    env = marl_sched.airme_v0.env()                         # PettingZoo AEC
     policy = marl_sched.load_policy("airme-local-profit")   # needs torch, the environments do not
 
 Importing this package registers its environments with Gymnasium and imports nothing else; each name is loaded

@@ -22,7 +22,7 @@ ALLOWED = {
     "cli": {"core", "envs", "agents", "train", "comms", "configs", "cli"},
 }
 # Public modules that are a domain's face, and therefore stand on the room that holds it.
-FRONT_DOORS = {"marl_sched.airme_v0": "agents", "marl_sched.murse_v0": "agents"}
+FRONT_DOORS = {"marl_sched.airme_v0": "envs", "marl_sched.murse_v0": "envs"}
 
 # What may need torch: the TorchRL face, learned policies and training. Comparing rules does not.
 NEEDS_TORCH = ("marl_sched.envs.torchrl", "marl_sched.agents.hetgat", "marl_sched.train.")
