@@ -1,13 +1,19 @@
-"""Keeping a run's best policy as the two files that everything else loads."""
+"""Keeping a run's best policy as the two files that everything else loads, and measuring it for its card."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
+import msgspec
+
 from marl_sched.agents.cards import PolicyCard, Sizes
-from marl_sched.agents.hetgat.checkpoint import save_network
+from marl_sched.agents.hetgat.checkpoint import load_network, save_network
 from marl_sched.agents.hetgat.network import HetGATNetwork
+from marl_sched.agents.hetgat.policy import HetGATPolicy
+from marl_sched.domain import get_domain
 from marl_sched.train.config import GaeConfig, RunRecord
+from marl_sched.train.evaluate import Settings, evaluate_scheduler
 
 BEST = "policy.safetensors"
 
@@ -38,3 +44,30 @@ def save_best(network: HetGATNetwork, record: RunRecord, update: int, score: flo
         training_knowledge="a critic on the full graph" if central else "",
     )
     save_network(directory / BEST, network, card)
+
+
+def export_policy(
+    run_dir: Path, path: Path, *, scales: Sequence[str], instances: int = 100, episodes: int = 10, seed: int = 1
+) -> PolicyCard:
+    """Measure a run's best policy, greedy, on unseen instances of each scale, and write it with those scores to `path`.
+
+    Instances and noise are those of `marl-sched evaluate --seed SEED`. Returns the card as written.
+    """
+    network, card = load_network(run_dir / BEST)
+    domain, options = get_domain(card.domain), dict(card.view)
+    view = domain.views[options.pop("kind")](**options)
+    measured = {}
+    for scale in scales:
+        settings = Settings(episodes=episodes, seed=seed, view=view, objective=card.objective, scale=scale)
+        scores = evaluate_scheduler(domain, HetGATPolicy(network), domain.instances(scale, instances, seed), settings)
+        means = scores.measures[card.objective].mean(axis=1)
+        measured[scale] = {
+            "M1": float(means.mean()),
+            "std": float(means.std()),
+            "visible_share": scores.visible_share,
+            "instances": instances,
+            "episodes": episodes,
+            "seed": seed,
+        }
+    save_network(path, network, msgspec.structs.replace(card, scores={**card.scores, **measured}))
+    return load_network(path)[1]
