@@ -56,22 +56,36 @@ def task_network(
 
 
 @njit(cache=True)
-def simplified_network(durations: np.ndarray, lags: np.ndarray, deadlines: np.ndarray, horizon: int) -> np.ndarray:
-    """The network on starts alone, not yet closed, int64 (n + 2, n + 2), points s0, s_1, ..., s_n, f0.
+def simplified_bounds(durations: np.ndarray, lags: np.ndarray, deadlines: np.ndarray, horizon: int) -> np.ndarray:
+    """The bounds (source, target, bound) on starts alone, int64 (m, 3), points s0, s_1, ..., s_n, f0.
 
     Bounds that lead to a finish lead to its start instead, less the duration, int64 (n,) (section 5.4.1).
-    Closed, it is the minimum distance graph of section 4.3.1 without its finishes.
     """
     n = len(durations)
-    distances = unconstrained(n + 2)
-    relax(distances, 0, n + 1, horizon)
-    relax(distances, n + 1, 0, 0)
+    bounds, m = np.empty((2 + 3 * n + n * n, 3), np.int64), 2
+    bounds[0] = (0, n + 1, horizon)
+    bounds[1] = (n + 1, 0, 0)
     for i in range(n):
-        relax(distances, i + 1, 0, 0)
-        relax(distances, n + 1, i + 1, -durations[i])
+        bounds[m] = (i + 1, 0, 0)
+        bounds[m + 1] = (n + 1, i + 1, -durations[i])
+        m += 2
         if deadlines[i] != NO_DEADLINE:
-            relax(distances, 0, i + 1, deadlines[i] - durations[i])
+            bounds[m] = (0, i + 1, deadlines[i] - durations[i])
+            m += 1
         for j in range(n):
             if lags[i, j] >= 0:
-                relax(distances, i + 1, j + 1, -lags[i, j] - durations[j])
+                bounds[m] = (i + 1, j + 1, -lags[i, j] - durations[j])
+                m += 1
+    return bounds[:m]
+
+
+@njit(cache=True)
+def network_of(bounds: np.ndarray, n_points: int) -> np.ndarray:
+    """The network of int64 (m, 3) bounds, not yet closed, int64 (n_points, n_points).
+
+    Closed, that of `simplified_bounds` is the minimum distance graph of section 4.3.1 without its finishes.
+    """
+    distances = unconstrained(n_points)
+    for k in range(len(bounds)):
+        relax(distances, bounds[k, 0], bounds[k, 1], bounds[k, 2])
     return distances

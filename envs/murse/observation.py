@@ -33,17 +33,18 @@ from marl_sched.envs.murse.graph import (
     Arrays,
 )
 from marl_sched.envs.murse.instance import NO_DEADLINE
-from marl_sched.envs.murse.network import simplified_network
+from marl_sched.envs.murse.network import network_of, simplified_bounds
 from marl_sched.envs.murse.rules import Rules
 from marl_sched.envs.murse.state import NEVER, NOBODY, State
 from marl_sched.envs.murse.timetable import earliest_start
-from marl_sched.envs.murse.views import Sight, look, standpoint
+from marl_sched.envs.murse.views import Sight, new_sight, standpoint, survey
 from marl_sched.temporal_network import UNBOUNDED, close
 
 
 @njit(cache=True, error_model="numpy")
 def observe(state: State, rules: Rules, agents: np.ndarray, sensing: float, comm: float, out: Arrays) -> None:
     """Write what each row's agent, int64 (B,), sees; a negative agent sees nothing."""
+    sight = new_sight(state)
     for b in range(len(agents)):
         clear(out, b)
         out.action_mask[b, 0] = 1
@@ -51,7 +52,7 @@ def observe(state: State, rules: Rules, agents: np.ndarray, sensing: float, comm
         viewer = agents[b]
         if viewer < 0:
             continue
-        sight = look(state, rules, b, viewer, sensing, comm)
+        survey(state, rules, b, viewer, sensing, comm, sight)
         see_agents(state, b, viewer, sight, out)
         see_tasks(state, b, viewer, sight, out)
         see_durations(state, b, sight, out)
@@ -257,29 +258,30 @@ def see_network(state: State, b: int, sight: Sight, out: Arrays) -> None:
         if sight.seen[task]:
             seen[count] = task
             count += 1
-    distances = visible_network(seen[:count], state.tasks[b], state.pairs[b, :n, :m], state.lags[b], sight)
-    sparse = len(out.aug) > 0
-    if not sparse:
-        close(distances)
+    bounds = visible_bounds(seen[:count], state.tasks[b], state.pairs[b, :n, :m], state.lags[b], sight)
     slots = np.zeros(count + 2, np.int64)
     slots[1 : count + 1] = seen[:count] + 1
     slots[count + 1] = n + 1
-    temporal, bounds = out.temporal[b], out.temporal_attributes[b]
+    if len(out.aug) > 0:
+        for k in range(len(bounds)):
+            source, target, bound = slots[bounds[k, 0]], slots[bounds[k, 1]], bounds[k, 2] / unit
+            out.temporal[b, target, source] = out.aug[b, source, target] = 1
+            out.temporal_attributes[b, target, source, 0] = out.aug_attributes[b, source, target, 0] = bound
+        return
+    distances = network_of(bounds, count + 2)
+    close(distances)
     for u in range(count + 2):
         for v in range(count + 2):
             if u != v and distances[u, v] < UNBOUNDED:
-                temporal[slots[v], slots[u]] = 1
-                bounds[slots[v], slots[u], 0] = distances[u, v] / unit
-    if sparse:
-        out.aug[b] = temporal.T
-        out.aug_attributes[b, :, :, 0] = bounds[:, :, 0].T
+                out.temporal[b, slots[v], slots[u]] = 1
+                out.temporal_attributes[b, slots[v], slots[u], 0] = distances[u, v] / unit
 
 
 @njit(cache=True, error_model="numpy")
-def visible_network(
+def visible_bounds(
     seen: np.ndarray, tasks: np.ndarray, pairs: np.ndarray, lags: np.ndarray, sight: Sight
 ) -> np.ndarray:
-    """The simplified network of the tasks in sight, int64 (k,) `seen`, as the viewer knows them.
+    """The bounds between the tasks in sight, int64 (k,) `seen`, as the viewer knows them; see simplified_bounds.
 
     tasks TASK (N,), pairs PAIR (N, A), lags int64 (N, N). An unscheduled task counts with the shortest estimate of
     those within hearing. The order of an agent's tasks is a wait of 0.
@@ -308,7 +310,7 @@ def visible_network(
                 horizon += lag
             elif i != j and owners[i] != NOBODY and owners[i] == owners[j]:
                 inner[i, j] = 0 if sight.finish[seen[j]] <= sight.start[seen[i]] else -1
-    return simplified_network(durations, inner, deadlines, horizon)
+    return simplified_bounds(durations, inner, deadlines, horizon)
 
 
 @njit(cache=True, error_model="numpy")

@@ -164,13 +164,25 @@ def believes(
 
 
 @njit(cache=True)
-def look(state: State, rules: Rules, b: int, viewer: int, sensing: float, comm: float) -> Sight:
-    """Everything that the viewer knows under (sensing, comm)."""
+def new_sight(state: State) -> Sight:
+    """Room for what an agent knows, to be filled by `survey`."""
     n, m = state.tasks.shape[1], state.agents.shape[1]
-    heard, seen, known = np.zeros(m, np.bool_), np.zeros(n, np.bool_), np.zeros(n, np.bool_)
-    start, finish = np.zeros(n, np.int64), np.zeros(n, np.int64)
-    hears(state, b, viewer, comm, heard)
-    senses(state, b, viewer, sensing, seen)
-    knows(state, b, viewer, heard, known)
-    believes(state, rules, b, viewer, heard, known, start, finish)
-    return Sight(heard, seen, known, start, finish)
+    times = np.zeros((2, n), np.int64)
+    return Sight(np.zeros(m, np.bool_), np.zeros(n, np.bool_), np.zeros(n, np.bool_), times[0], times[1])
+
+
+@njit(cache=True)
+def survey(state: State, rules: Rules, b: int, viewer: int, sensing: float, comm: float, sight: Sight) -> None:
+    """Fill in everything that the viewer knows under (sensing, comm)."""
+    hears(state, b, viewer, comm, sight.heard)
+    senses(state, b, viewer, sensing, sight.seen)
+    knows(state, b, viewer, sight.heard, sight.known)
+    believes(state, rules, b, viewer, sight.heard, sight.known, sight.start, sight.finish)
+
+
+@njit(cache=True)
+def look(state: State, rules: Rules, b: int, viewer: int, sensing: float, comm: float) -> Sight:
+    """Everything that the viewer knows under (sensing, comm), in fresh arrays."""
+    sight = new_sight(state)
+    survey(state, rules, b, viewer, sensing, comm, sight)
+    return sight

@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from marl_sched.envs.murse import graph
-from marl_sched.envs.murse.network import simplified_network
+from marl_sched.envs.murse.network import network_of, simplified_bounds
 from marl_sched.envs.murse.simulator import MurseSimulator
 from marl_sched.envs.murse.views import FullView, LocalView
 from marl_sched.errors import InvalidOptionError
-from marl_sched.temporal_network import UNBOUNDED, close
+from marl_sched.temporal_network import close
 from tests.murse.problems import instances, play_randomly, played, problem, three_tasks
 from tests.murse.test_temporal_network import FIGURE_4_2
 
@@ -26,7 +26,7 @@ def seen(simulator: MurseSimulator, agent: int) -> dict[str, np.ndarray]:
 def test_simplified_network_of_figure_4_2_is_its_table_without_the_finishes():
     lags = np.full((3, 3), -1)
     lags[0, 1] = 3
-    distances = simplified_network(np.array([4, 8, 7]), lags, np.array([-1, -1, 8]), 30)
+    distances = network_of(simplified_bounds(np.array([4, 8, 7]), lags, np.array([-1, -1, 8]), 30), 5)
     assert close(distances)
     kept = [0, 2, 4, 6, 1]  # s0, s1, s2, s3, f0 in the table's order
     expected = FIGURE_4_2[np.ix_(kept, kept)].copy()
@@ -36,8 +36,8 @@ def test_simplified_network_of_figure_4_2_is_its_table_without_the_finishes():
 def test_sparse_network_holds_only_the_rerouted_bounds_of_section_5_4_1():
     lags = np.full((2, 2), -1)
     lags[1, 0] = 3
-    distances = simplified_network(np.array([4, 8]), lags, np.array([-1, 20]), 30)
-    bounded = {(u, v): int(distances[u, v]) for u, v in np.argwhere(distances < UNBOUNDED) if u != v}
+    bounds = simplified_bounds(np.array([4, 8]), lags, np.array([-1, 20]), 30)
+    bounded = {(u, v): bound for u, v, bound in bounds.tolist()}
     assert bounded == {(0, 3): 30, (3, 0): 0, (1, 0): 0, (2, 0): 0, (3, 1): -4, (3, 2): -8, (0, 2): 12, (2, 1): -7}
 
 
