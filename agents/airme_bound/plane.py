@@ -99,9 +99,7 @@ def wear(landings: int, hours: int) -> int:
 
 
 @njit(cache=True)
-def repair_values(
-    time: int, horizon: int, reward: Reward, paid: np.ndarray, new: np.ndarray, out: np.ndarray
-) -> None:
+def repair_values(time: int, horizon: int, reward: Reward, paid: np.ndarray, new: np.ndarray, out: np.ndarray) -> None:
     """Expected value of sending a crew now, float64 (2, wear) for healthy and broken planes.
 
     `paid` float64 (T + 1,) sums the prices of the hours before, `new` float64 (T + 1,) is a new plane's value.
@@ -174,9 +172,7 @@ def fill_caps(value: np.ndarray, immortal: np.ndarray) -> None:
 
 
 @njit(cache=True)
-def solve(
-    model: PlaneModel, reward: Reward, prices: np.ndarray, policy: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def solve(model: PlaneModel, reward: Reward, prices: np.ndarray, policy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Backward induction over the horizon, prices float64 (T,) per crew-hour.
 
     Returns (values at hour 0 float64 (11, L + 2, H + 2), a new plane's value float64 (T + 1,)). Where `policy`
@@ -245,9 +241,7 @@ def expected_crew_hours(model: PlaneModel, policy: np.ndarray, mass: np.ndarray)
 
 
 @njit(cache=True)
-def spend_hour(
-    model: PlaneModel, state: int, landings: int, hours: int, planes: float, following: np.ndarray
-) -> None:
+def spend_hour(model: PlaneModel, state: int, landings: int, hours: int, planes: float, following: np.ndarray) -> None:
     """Spread planes that are not repaired over where they are an hour later."""
     if state == BROKEN:
         following[BROKEN, landings, hours] += planes
@@ -287,9 +281,7 @@ def send_crews(time: int, jobs: np.ndarray, change: np.ndarray, new: np.ndarray)
 
 
 @njit(cache=True)
-def index_slices(
-    model: PlaneModel, reward: Reward, prices: np.ndarray, hours: np.ndarray, out: np.ndarray
-) -> None:
+def index_slices(model: PlaneModel, reward: Reward, prices: np.ndarray, hours: np.ndarray, out: np.ndarray) -> None:
     """Advantage of repairing now over waiting an hour, per expected repair hour, at some hours int64 (S,).
 
     Written to `out` float32 (S, 11, L + 1, H + 1), the hours ascending.
