@@ -47,18 +47,28 @@ def save_best(network: HetGATNetwork, record: RunRecord, update: int, score: flo
 
 
 def export_policy(
-    run_dir: Path, path: Path, *, scales: Sequence[str], instances: int = 100, episodes: int = 10, seed: int = 1
+    run_dir: Path,
+    path: Path,
+    *,
+    scales: Sequence[str],
+    instances: int = 100,
+    episodes: int = 10,
+    seed: int = 1,
+    length: int | None = None,
 ) -> PolicyCard:
     """Measure a run's best policy, greedy, on unseen instances of each scale, and write it with those scores to `path`.
 
-    Instances and noise are those of `marl-sched evaluate --seed SEED`. Returns the card as written.
+    Instances and noise are those of `marl-sched evaluate --seed SEED`; `length` is the simulated time of an
+    episode, None: the environment's. Returns the card as written.
     """
     network, card = load_network(run_dir / BEST)
     domain, options = get_domain(card.domain), dict(card.view)
     view = domain.views[options.pop("kind")](**options)
     measured = {}
     for scale in scales:
-        settings = Settings(episodes=episodes, seed=seed, view=view, objective=card.objective, scale=scale)
+        settings = Settings(
+            episodes=episodes, seed=seed, view=view, objective=card.objective, horizon=length, scale=scale
+        )
         scores = evaluate_scheduler(domain, HetGATPolicy(network), domain.instances(scale, instances, seed), settings)
         means = scores.measures[card.objective].mean(axis=1)
         measured[scale] = {

@@ -93,6 +93,13 @@ def test_the_best_policy_is_kept_with_a_card_that_says_how_it_was_made(tmp_path:
     assert HetGATPolicy.load(directory / "policy.safetensors").card is not None
 
 
+def test_every_update_is_logged_as_csv_and_for_tensorboard(tmp_path: Path):
+    directory = train_from_overrides([*GAE, f"run_dir={tmp_path / 'run'}"], quiet=True)
+    assert all(float(row["decisions"]) > 0 and float(row["reward_rate"]) for row in rows(directory))
+    assert [bool(row["validation"]) for row in rows(directory)] == [False, True, False, True]
+    assert list((directory / "tensorboard").glob("events.out.tfevents.*"))
+
+
 def test_a_run_is_not_written_over_another(tmp_path: Path):
     (tmp_path / "config.json").write_text("{}")
     with pytest.raises(InvalidOptionError, match="holds a run already"):
