@@ -18,7 +18,7 @@ from marl_sched.domain import Domain
 from marl_sched.errors import InvalidFileError
 from marl_sched.simulation import TurnSimulator
 from marl_sched.train import plots
-from marl_sched.train.evaluate import Settings
+from marl_sched.train.evaluate import Settings, own_options
 
 SECONDS, SCORE = "seconds", "validation"  # the columns of a training log that are drawn
 
@@ -48,7 +48,8 @@ def draw_learning_curves(path: Path, logs: Iterable[Path]) -> Path:
 
 def play_episode(domain: Domain, scheduler: Scheduler, instance: Any, settings: Settings) -> TurnSimulator:
     """The simulator after episode 0 of an instance, with what its pictures are drawn from on record."""
-    simulator = settings.simulator(domain, [instance], **domain.render_options.get("rgb_array", {}))
+    options = {**own_options(scheduler, settings), **domain.render_options.get("rgb_array", {})}
+    simulator = settings.simulator(domain, [instance], **options)
     simulator.reset(seed=settings.seed, episodes=[0])
     scheduler.start(simulator, np.ones(1, np.bool_))
     while not simulator.over.all():

@@ -129,7 +129,7 @@ def evaluate_scheduler(
     shares, turns = 0.0, 0
     for rows in _chunks(total, max_rows or _rows_that_fit(domain, instances, settings)):
         chosen = [instances[row // settings.episodes] for row in rows]
-        simulator = settings.simulator(domain, chosen, **_own_options(scheduler, settings))
+        simulator = settings.simulator(domain, chosen, **own_options(scheduler, settings))
         simulator.reset(seed=settings.seed, episodes=[row % settings.episodes for row in rows])
         scheduler.start(simulator, np.ones(simulator.batch, np.bool_))
         for turn in count():
@@ -153,7 +153,7 @@ def evaluate_scheduler(
     )
 
 
-def _own_options(scheduler: Scheduler, settings: Settings) -> dict[str, Any]:
+def own_options(scheduler: Scheduler, settings: Settings) -> dict[str, Any]:
     """The simulator's options that belong to a scheduler, where the settings do not choose others."""
     return {name: value for name, value in scheduler.simulator_options.items() if name not in settings.options}
 

@@ -9,17 +9,18 @@ from rich.console import Console
 from rich.table import Table
 
 _WIDE = 110  # columns of a terminal
+_ALWAYS = ("feasible",)  # without which M1 says little
 
 
 def print_scores(results: dict[str, Any]) -> None:
     """The table of `marl-sched evaluate`: a row per scheduler, best mean first; a narrow terminal gets less of it."""
     console = Console()
-    measures = _other_measures(results) if console.width >= _WIDE else []
+    measures = [name for name in _other_measures(results) if console.width >= _WIDE or name in _ALWAYS]
     table = Table(title=_title(results), caption=_caption(results), show_lines=False, box=box.SIMPLE_HEAD)
     table.add_column("scheduler", overflow="fold")
     gain = ["M2 %"] if "reference" in results else []
     for heading in ("M1", "IQM", f"less {results['baseline']}", *gain, *measures):
-        table.add_column(heading, justify="right", min_width=7)
+        table.add_column(heading, justify="right", min_width=7, overflow="fold")
     lower = results["better"] == "lower"
     for name, row in sorted(results["schedulers"].items(), key=lambda item: item[1]["M1"]["mean"], reverse=not lower):
         m1, difference = row["M1"], row["difference"]

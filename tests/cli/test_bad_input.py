@@ -164,6 +164,7 @@ def test_a_training_log_that_is_none_is_refused_before_the_work(run, tmp_path, c
         (("--policy", "condition", "--scale", "huge"), ["unknown scale of airme 'huge'"]),
         (("--policy", "condition", "--instance", "nowhere.json"), ["nowhere.json"]),
         (("--policy", "condition", "--deadline", "0"), ["deadline"]),
+        (("--policy", "edf", "--env", "murse"), ["murse has no telemetry"]),
         (("--policy", "condition", "--patience", "0"), ["patience"]),
         (("--policy", "condition", "--agent-policy", "crew_3"), ["AGENT=POLICY", "'crew_3'"]),
         (("--policy", "condition", "--agent-policy", "crew_99=random"), ["'crew_99'", "crew_0"]),
