@@ -10,7 +10,7 @@ from marl_sched.agents.murse.problem import Round
 from marl_sched.envs.murse.instance import NO_DEADLINE
 from marl_sched.envs.murse.simulator import MurseSimulator
 from marl_sched.envs.murse.state import NOBODY
-from marl_sched.envs.murse.views import EVERYWHERE, look
+from marl_sched.envs.murse.views import believes
 from marl_sched.errors import InvalidOptionError
 from marl_sched.simulation import TurnSimulator
 
@@ -36,12 +36,15 @@ def remaining_round(simulator: MurseSimulator, row: int) -> Round:
     """
     whole, state = estimated_round(simulator, row), simulator.state
     n, clock = whole.n_tasks, int(state.rows["clock"][row])
-    sight = look(state, simulator.rules, row, int(simulator.acting[row]), EVERYWHERE, EVERYWHERE)
     agents = state.tasks["agent"][row, :n].copy()
     taken = np.flatnonzero(agents != NOBODY)
+    start, finish = np.zeros((2, simulator.max_targets), np.int64)
+    heard = np.ones(simulator.max_agents, np.bool_)
+    viewer = int(simulator.acting[row])
+    believes(state, simulator.rules, row, viewer, heard, state.tasks["agent"][row] != NOBODY, start, finish)
     durations, ready = whole.durations.copy(), np.full(whole.n_agents, clock)
     fixed, deadlines = np.full(n, -1), whole.deadlines.copy()
-    durations[taken, agents[taken]] = (sight.finish - sight.start)[taken]
-    fixed[taken], deadlines[taken] = sight.start[taken], NO_DEADLINE
-    np.maximum.at(ready, agents[taken], sight.finish[taken])
+    durations[taken, agents[taken]] = (finish - start)[taken]
+    fixed[taken], deadlines[taken] = start[taken], NO_DEADLINE
+    np.maximum.at(ready, agents[taken], finish[taken])
     return replace(whole, durations=durations, deadlines=deadlines, fixed=fixed, agents=agents, ready=ready)

@@ -84,8 +84,9 @@ def task_windows(problem: Round) -> tuple[np.ndarray, np.ndarray] | None:
     network = task_network(shortest, problem.durations.max(axis=1), problem.lags, problem.deadlines, horizon)
     if not close(network):
         return None
-    tasks = np.arange(problem.n_tasks)
-    return earliest_times(network, ORIGIN)[start_point(tasks)], latest_times(network, ORIGIN)[finish_point(tasks)]
+    starts = [start_point(task) for task in range(problem.n_tasks)]
+    finishes = [finish_point(task) for task in range(problem.n_tasks)]
+    return earliest_times(network, ORIGIN)[starts], latest_times(network, ORIGIN)[finishes]
 
 
 def overload(
