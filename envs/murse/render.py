@@ -61,7 +61,7 @@ def gantt_figure(data: dict[str, Any]) -> Figure:
         if deadline is not None:
             low, high = job["agent"] - 0.45, job["agent"] + 0.45
             axes.plot([deadline, deadline], [low, high], color=LATE if task in late else "black", linewidth=1.5)
-            axes.text(deadline, high, f"{task}", fontsize=6, ha="center", va="bottom")
+            axes.text(deadline, low, f"{task}", fontsize=7, ha="center", va="bottom")
         for wait in data["tasks"][task - 1]["waits"]:
             if wait["after"] in rows:
                 before = rows[wait["after"]]
