@@ -118,8 +118,7 @@ class _Tables:
 
 def _usual_starts() -> tuple[np.ndarray, np.ndarray]:
     """Hours and landings, int64 (N,), of every plane that the generator can draw."""
-    hours = np.arange(121)
-    pairs = [(h, n) for h in hours for n in range(max(0, h // 10 - 2), h // 5 + 3)]
+    pairs = [(h, n) for h in range(121) for n in range(max(0, h // 10 - 2), h // 5 + 3)]
     starts = np.array(pairs, np.int64).T
     return starts[0], starts[1]
 
