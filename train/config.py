@@ -7,6 +7,7 @@ outside its bounds gives one line that says where.
 
 from __future__ import annotations
 
+import inspect
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,6 +24,9 @@ from omegaconf.errors import OmegaConfBaseException
 from marl_sched.domain import get_domain
 from marl_sched.errors import InvalidFileError, InvalidOptionError
 from marl_sched.files import read_json
+
+# Arguments of every domain's simulator that other keys of the configuration, or the trainer, decide on.
+_SET_ELSEWHERE = {"instances", "view", "objective", "horizon", "seed", "pad"}
 
 Count = Annotated[int, Meta(ge=1)]
 Natural = Annotated[int, Meta(ge=0)]
@@ -180,6 +184,13 @@ def _checked(config: TrainConfig) -> TrainConfig:
     for scale in config.env.scales:
         domain.require_scale(scale)
     domain.require_objective(config.env.objective)
+    known = set(inspect.signature(domain.simulator).parameters) - _SET_ELSEWHERE
+    for option in config.env.options:
+        if option not in known:
+            raise InvalidOptionError(
+                f"train: env.options.{option}: the simulator of {domain.name} has no such option to set here; "
+                f"known: {', '.join(sorted(known))}"
+            )
     _view(config)
     return config
 

@@ -19,7 +19,7 @@ from marl_sched.train.collect import Rollout
 from marl_sched.train.config import RunRecord, load_config, load_record
 from marl_sched.train.estimators import Estimate
 from marl_sched.train.logging import RunLog
-from marl_sched.train.parts import build
+from marl_sched.train.parts import Parts, build
 from marl_sched.train.ppo import Sampler, UpdateReport, samples_of
 
 CONFIG = "config.json"
@@ -36,22 +36,22 @@ def train_from_overrides(overrides: Sequence[str], *, quiet: bool = False) -> Pa
     if (directory / CONFIG).exists():
         raise InvalidOptionError(f"run_dir: {directory} holds a run already; resume it or choose another")
     record = RunRecord(config=config, overrides=list(overrides), revision=source_revision())
+    parts = build(record)
     write_json(directory / CONFIG, msgspec.to_builtins(record))
-    return train(record, directory, quiet=quiet)
+    return train(parts, Counters(), directory, quiet=quiet)
 
 
 def resume(run_dir: str | Path, *, quiet: bool = False) -> Path:
     """Go on with a run from its last checkpoint, exactly as if it had not stopped."""
     directory = Path(run_dir)
-    return train(load_record(directory / CONFIG), directory, resumed=True, quiet=quiet)
+    parts = build(load_record(directory / CONFIG))
+    return train(parts, parts.restore(directory), directory, quiet=quiet)
 
 
-def train(record: RunRecord, directory: Path, *, resumed: bool = False, quiet: bool = False) -> Path:
+def train(parts: Parts, counters: Counters, directory: Path, *, quiet: bool = False) -> Path:
     """The loop. Everything random in an update is a function of (seed, update, instance number)."""
-    config = record.config
+    config = parts.record.config
     torch.set_num_threads(config.threads)
-    parts = build(record)
-    counters = parts.restore(directory) if resumed else Counters()
     with RunLog(directory, updates=config.updates, start=counters.update, quiet=quiet) as log:
         while counters.update < config.updates:
             started = time.perf_counter()

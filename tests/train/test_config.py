@@ -41,6 +41,8 @@ def test_published_curriculum_is_the_dissertations():
         ("+view.reach=1", "view.reach: the view 'full' has no such option"),
         ("algorithm.ppo.epochs=0", "`int` >= 1 - at `$.algorithm.ppo.epochs`"),
         ("seed=many", "Expected `int`, got `str` - at `$.seed`"),
+        ("+env.options.speed=2", "env.options.speed: the simulator of airme has no such option"),
+        ("+env.options.horizon=2", "env.options.horizon"),
         ("view=panorama", "Available options in 'view'"),
     ],
 )
