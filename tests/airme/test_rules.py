@@ -203,37 +203,5 @@ def test_rules_choose_only_what_is_legal_and_agree_between_batch_and_agent(name:
         simulator.step(targets)
 
 
-def m1(name: str, n: int, scale: str = "small") -> float:
-    """Mean M1 for profit over n instances x 2 episodes with the instances' own noise."""
-    instances = [generate(scale, np.random.default_rng([11, i])) for i in range(n)]
-    simulator = AirmeSimulator([i for i in instances for _ in range(2)])
-    simulator.reset(seed=1, episodes=np.tile([0, 1], n))
-    rule = RULES[name]()
-    while not simulator.over.all():
-        simulator.step(rule.decide(simulator))
-    return float(simulator.objectives()["profit"].mean())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "expected", "tolerance"),
-    [
-        ("corrective-published", 0.5375, 0.004),
-        ("corrective", 0.545, 0.004),
-        ("condition", 0.656, 0.008),
-        ("model-based", 0.667, 0.008),
-    ],
-)
-def test_rules_reach_the_reference_values(name: str, expected: float, tolerance: float) -> None:
-    # Reference code, 100 small instances x 10 episodes; 1 000 x 2 here.
-    assert m1(name, 1000) == pytest.approx(expected, abs=tolerance)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("scale", ["small", "medium", "large"])
-def test_preventive_first_passes_the_published_network(scale: str) -> None:
-    assert m1("preventive-first", 100, scale) >= 0.700
-
-
 def test_published_types_are_those_of_the_risk_above() -> None:
     assert [kind.name for kind in PUBLISHED_TYPES] == ["fixed_wing", "helicopter"]
