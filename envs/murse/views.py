@@ -178,11 +178,3 @@ def survey(state: State, rules: Rules, b: int, viewer: int, sensing: float, comm
     senses(state, b, viewer, sensing, sight.seen)
     knows(state, b, viewer, sight.heard, sight.known)
     believes(state, rules, b, viewer, sight.heard, sight.known, sight.start, sight.finish)
-
-
-@njit(cache=True)
-def look(state: State, rules: Rules, b: int, viewer: int, sensing: float, comm: float) -> Sight:
-    """Everything that the viewer knows under (sensing, comm), in fresh arrays."""
-    sight = new_sight(state)
-    survey(state, rules, b, viewer, sensing, comm, sight)
-    return sight
