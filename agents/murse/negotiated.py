@@ -13,6 +13,7 @@ from marl_sched.agents.auctions.tessi import TessiBidder
 from marl_sched.agents.base import Scheduler
 from marl_sched.agents.murse.snapshot import as_murse, estimated_round
 from marl_sched.agents.murse.traffic import Traffic
+from marl_sched.agents.murse.windows import induced_deadlines
 from marl_sched.envs.murse.simulator import MurseSimulator
 from marl_sched.envs.murse.state import NOBODY
 from marl_sched.errors import InvalidOptionError
@@ -28,6 +29,8 @@ class NegotiatingScheduler(Scheduler):
     as far as the simulator's view lets them, so everybody under the full view. Afterwards they say nothing more:
     an agent comes to a task that another one has taken if it did not hear of it, which is a conflict, and then
     crosses it off its list.
+
+    What a task with a deadline waits for has to end in time for it; everybody knows the waits and deadlines.
 
     Attributes:
         traffic: messages and bytes by row and round.
@@ -71,9 +74,9 @@ class NegotiatingScheduler(Scheduler):
 
     def _negotiate(self, simulator: MurseSimulator, row: int) -> None:
         problem, instance = estimated_round(simulator, row), simulator.instances[row]
+        deadlines = induced_deadlines(problem)
         diaries = [
-            Diary(agent, problem.durations, problem.lags, problem.near, problem.deadlines)
-            for agent in range(problem.n_agents)
+            Diary(agent, problem.durations, problem.lags, problem.near, deadlines) for agent in range(problem.n_agents)
         ]
         bidders = [self.bidder(diary, problem.n_agents) for diary in diaries]
         radius = simulator.view.limits[1] if self._radius is None else self._radius

@@ -25,11 +25,9 @@ from marl_sched.agents.murse.following import PlanningScheduler
 from marl_sched.agents.murse.list_schedule import edf_schedule, list_schedule
 from marl_sched.agents.murse.problem import Plan, Round
 from marl_sched.agents.murse.snapshot import estimated_round
-from marl_sched.envs.murse.network import ORIGIN, finish_point, start_point, task_network
+from marl_sched.agents.murse.windows import task_windows
 from marl_sched.envs.murse.simulator import MurseSimulator
-from marl_sched.envs.murse.timetable import longest_round
 from marl_sched.errors import InvalidOptionError
-from marl_sched.temporal_network import close, earliest_times, latest_times
 
 # A workload need not be the very least, another allocation is tried anyway; deterministic seconds depend on no clock.
 _PROGRAM_SECONDS = 0.1
@@ -72,21 +70,6 @@ def tercio(problem: Round, allocations: int) -> Plan:
             best = plan
         program.cut(np.arange(problem.n_tasks), doers)
     return best
-
-
-def task_windows(problem: Round) -> tuple[np.ndarray, np.ndarray] | None:
-    """Earliest start and latest finish of every task, int64 (N,) each, by the temporal network alone.
-
-    None if the network is inconsistent even with everybody at their shortest.
-    """
-    shortest = np.where(problem.eligible, problem.durations, np.iinfo(np.int64).max).min(axis=1)
-    horizon = int(longest_round(problem.durations, problem.lags))
-    network = task_network(shortest, problem.durations.max(axis=1), problem.lags, problem.deadlines, horizon)
-    if not close(network):
-        return None
-    starts = [start_point(task) for task in range(problem.n_tasks)]
-    finishes = [finish_point(task) for task in range(problem.n_tasks)]
-    return earliest_times(network, ORIGIN)[starts], latest_times(network, ORIGIN)[finishes]
 
 
 def overload(

@@ -14,7 +14,8 @@ from marl_sched.agents.murse.genetic import GeneticEdf, evolve
 from marl_sched.agents.murse.list_schedule import edf_priority, edf_schedule, list_schedule
 from marl_sched.agents.murse.optimal import ExactScheduler, RollingScheduler
 from marl_sched.agents.murse.problem import Round
-from marl_sched.agents.murse.tercio import Tercio, overload, task_windows
+from marl_sched.agents.murse.tercio import Tercio, overload
+from marl_sched.agents.murse.windows import induced_deadlines, task_windows
 from marl_sched.agents.murse_rules import RULES
 from marl_sched.agents.registry import create_scheduler
 from marl_sched.domain import get_domain
@@ -156,6 +157,12 @@ def test_work_that_does_not_fit_before_a_moment_is_found_by_the_analytical_test(
     tasks, agents = overload(whole, np.array([0, 0, 1]), *windows)
     assert (tasks.tolist(), agents.tolist()) == ([0, 1], [0, 0])
     assert overload(whole, np.array([0, 1, 1]), *windows) is None
+
+
+def test_what_an_urgent_task_waits_for_is_urgent_too():
+    # task 3 ends by 20 and lasts 4, at least 5 after task 2: task 2 ends by 11; it lasts 3 and waits for task 1: 8
+    whole = Round.of(problem([[2], [3], [4], [6]], deadlines=[-1, -1, 20, -1], waits=[(1, 0, 0), (2, 1, 5)]))
+    assert induced_deadlines(whole).tolist() == [8, 11, 20, -1]
 
 
 def test_tercio_finds_the_only_feasible_allocation():
