@@ -147,8 +147,8 @@ def test_with_a_crew_for_every_plane_simulation_reaches_the_bound(objective: str
 
 @pytest.mark.slow
 def test_bound_is_above_every_schedulers_mean_and_the_index_comes_close() -> None:
-    instances = [generate("small", np.random.default_rng([5, i])) for i in range(30)]
-    bound = upper_bounds(Relaxation(instances), price_vectors=2).value
+    instances = [generate("small", np.random.default_rng([5, i])) for i in range(12)]
+    bound = upper_bounds(Relaxation(instances, nodes=4), price_vectors=1, evaluations=7).value
     for name in RULES:
         m1 = episodes(RULES[name](), instances, 4)
         error = m1.std(axis=1, ddof=1).mean() / np.sqrt(m1.size)
