@@ -1,0 +1,50 @@
+"""MuRSE on the command line: solvable problems, schedulers side by side, speed."""
+
+import json
+
+from marl_sched.agents.murse.exact import solve
+from marl_sched.agents.murse.problem import Round
+from marl_sched.envs.murse.reading import load
+from marl_sched.train import bench
+
+
+def test_feasible_problems_are_generated_on_demand(run, tmp_path):
+    assert run("generate", "murse", "--count", 2, "--seed", 3, "--feasible", "--out", tmp_path).code == 0
+    paths = sorted(tmp_path.glob("*.json"))
+    assert len(paths) == 2
+    assert all(solve(Round.of(load(path))).plan is not None for path in paths)
+
+
+def test_domains_without_infeasible_problems_say_so(run, tmp_path):
+    ended = run("generate", "airme", "--feasible", "--out", tmp_path)
+    assert ended.code == 2
+    assert "--feasible: the environment 'airme' has no infeasible instances" in ended.err
+
+
+def test_evaluation_tells_every_measure_of_every_round(run, tmp_path):
+    options = ("--env", "murse", "--scale", "small", "--rounds", 3, "--mode", "online", "--durations", "stochastic")
+    names = "edf-published,cbba,first-claim,exact"
+    view = ("--view", "local", "--comm", 0, "--sensing", 9, "--proximity", "none")
+    out = tmp_path / "r.json"
+    ended = run("evaluate", *options, *view, "--instances", 2, "--episodes", 1, "--schedulers", names, "--json", out)
+    assert ended.code == 0, ended.err
+    rows = json.loads(out.read_text())["schedulers"]
+    assert list(rows) == names.split(",")
+    for row in rows.values():
+        for measure in ("feasible", "makespan", "makespan_feasible", "conflicts"):
+            assert len(row[measure]["per_round"]) == 3
+        assert 0.0 <= row["feasible"]["mean"] <= 1.0
+        assert "mean" in row["gap_to_exact"]
+    for name in ("cbba", "first-claim"):
+        assert all(count > 0 for measure in ("messages", "bytes") for count in rows[name][measure]["per_round"])
+    assert rows["cbba"]["conflicts"]["mean"] > 0  # nobody hears anybody
+    assert rows["exact"]["conflicts"]["mean"] == 0
+
+
+def test_the_bench_measures_schedules_and_edf(run, tmp_path, monkeypatch):
+    for name, value in (("BATCH", 3), ("_AEC_TURNS", 20), ("_TORCHRL_STEPS", 2), ("_POLICY_DECISIONS", 2)):
+        monkeypatch.setattr(bench, name, value)
+    assert run("bench", "--env", "murse", "--repeats", 1, "--json", tmp_path / "b.json").code == 0
+    figures = json.loads((tmp_path / "b.json").read_text())
+    names = ("schedule_us_b1024", "edf_large_ms", "aec_turns_per_s", "torchrl_decisions_per_s")
+    assert all(figures[name] > 0 and figures["meaning"][name] for name in names)
