@@ -21,8 +21,8 @@ def task_windows(problem: Round) -> tuple[np.ndarray, np.ndarray] | None:
     network = task_network(shortest, problem.durations.max(axis=1), problem.lags, problem.deadlines, horizon)
     if not close(network):
         return None
-    tasks = np.arange(problem.n_tasks)
-    return earliest_times(network, ORIGIN)[start_point(tasks)], latest_times(network, ORIGIN)[finish_point(tasks)]
+    starts, finishes = (slice(point(0), None, point(1) - point(0)) for point in (start_point, finish_point))
+    return earliest_times(network, ORIGIN)[starts], latest_times(network, ORIGIN)[finishes]
 
 
 def induced_deadlines(problem: Round) -> np.ndarray:
