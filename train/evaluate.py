@@ -3,7 +3,8 @@
 Randomness is counter-based, so common random numbers cost nothing: entry (i, e) of every scheduler's scores is
 episode e of instance i, whatever the order, the batch or the process it was played in. M1 is an episode's mean
 of the objective, M2 its gain in percent over the domain's reference scheduler on the same instance. The
-reference always plays with the full view, as published.
+reference always plays with the full view, as published; paired differences are taken to it unless another
+baseline is named, which is then one of the table's schedulers under the table's view.
 
     table = evaluate(domain, {"corrective": scheduler}, instances, Settings(episodes=10, seed=1))
     write_json(path, table.as_json())
@@ -31,6 +32,7 @@ SCHEMA = 1
 REFERENCE, UNIT, BETTER = "reference", "unit", "better"
 EXACT = "exact"  # the scheduler that the others' gap is taken to where it plays
 SHARE_EVERY = 8  # turns between two readings of the visible share
+LOCAL_SHARE = 0.45  # a view that shows more of the graph than this is not called local
 _CHUNK_CELLS = 512 * 41 * 16  # pairs of target and agent in flight: 512 rows of a small AirME fleet
 
 Progress = Callable[[float], None]
@@ -180,7 +182,8 @@ def _chunks(total: int, size: int) -> Iterator[range]:
 
 
 def _rows_that_fit(domain: Domain, instances: Sequence[Any], settings: Settings) -> int:
-    sizes = settings.simulator(domain, instances, view=None)
+    # a scale sets the padding by itself; a user's own instances are padded to their largest
+    sizes = settings.simulator(domain, instances if settings.scale is None else instances[:1], view=None)
     return max(1, _CHUNK_CELLS // (sizes.max_targets * max(sizes.max_agents, 16)))
 
 
@@ -195,7 +198,7 @@ class Table:
         scores: name as the user typed it -> scores.
         reference: the name of what M2 is the gain over, and its scores under the full view; None where the
             domain has no reference scheduler.
-        baseline: the name of what paired differences are taken to, and its scores.
+        baseline: what paired differences are taken to: its name, the view it played with, its scores.
     """
 
     domain: Domain
@@ -203,7 +206,7 @@ class Table:
     n_instances: int
     scores: Mapping[str, Scores]
     reference: tuple[str, Scores] | None
-    baseline: tuple[str, Scores]
+    baseline: tuple[str, Any, Scores]
 
     def as_json(self) -> dict[str, Any]:
         """The table as schema 1 of `marl-sched evaluate --json`."""
@@ -214,13 +217,17 @@ class Table:
             "scale": settings.scale,
             "objective": settings.objective,
             "better": self.domain.extras.get(BETTER, "higher"),
-            "view": {**view_as_json(settings.view), "visible_share": self.visible_share},
+            "view": {
+                **view_as_json(settings.view),
+                "visible_share": self.visible_share,
+                "local": self.visible_share <= LOCAL_SHARE,
+            },
             "instances": self.n_instances,
             "episodes": settings.episodes,
             self.domain.extras.get(UNIT, "hours"): settings.horizon,
             "seed": settings.seed,
             "options": dict(settings.options),
-            "baseline": self.baseline[0],
+            "baseline": {"scheduler": self.baseline[0], "view": view_as_json(self.baseline[1])},
         }
         if self.reference is not None:
             name, scores = self.reference
@@ -248,9 +255,10 @@ class Table:
         if EXACT in self.scores:
             gap = percent_gain(m1, self.scores[EXACT].measures[objective])
             row["gap_to_exact"] = self._summary(gap).as_json()
-        difference = paired_difference(m1, self.baseline[1].measures[objective])
+        difference = paired_difference(m1, self.baseline[2].measures[objective])
         row["difference"] = {"to": self.baseline[0], **difference.as_json()}
         row["visible_share"] = scores.visible_share
+        row["local"] = scores.visible_share <= LOCAL_SHARE
         row["needs"] = scores.needs
         row["seconds"] = scores.seconds
         return row
@@ -273,14 +281,15 @@ def evaluate(
     """Play every scheduler and the reference on the same episodes.
 
     `reference` is what M2 is the gain over; it plays with the full view, and only once if it is in the table
-    with that view already. `baseline` is one of the schedulers or the reference, by default the reference,
-    else the first scheduler. `progress` is told a scheduler's name and the share of its work that is done.
-    Raises UnknownNameError for another baseline.
+    with that view already. `baseline` names one of the schedulers, which stands for itself under the view of
+    the table; None is the reference under the full view, or the first scheduler where there is no reference.
+    `progress` is told a scheduler's name and the share of its work that is done. Raises UnknownNameError for
+    a baseline that is not in the table.
     """
     if not schedulers:
         raise InvalidOptionError("schedulers: expected at least one")
-    known = [*schedulers, *([reference.name] if reference is not None else [])]
-    baseline = require("baseline", baseline or known[-1 if reference is not None else 0], known)
+    if baseline is not None:
+        require("baseline", baseline, schedulers)
     settings = settings.filled_in(domain)
 
     def play(name: str, scheduler: Scheduler, settings: Settings) -> Scores:
@@ -288,22 +297,31 @@ def evaluate(
         return evaluate_scheduler(domain, scheduler, instances, settings, progress=report)
 
     scores = {name: play(name, scheduler, settings) for name, scheduler in schedulers.items()}
-    comparable, held_against = dict(scores), None
+    held_against = None
     if reference is not None:
         if reference.name in scores and view_as_json(settings.view)["kind"] == "full":
             under_full_view = scores[reference.name]
         else:
             under_full_view = play(reference.name, reference, replace(settings, view=None))
         held_against = (reference.name, under_full_view)
-        comparable.setdefault(*held_against)
     return Table(
         domain=domain,
         settings=settings,
         n_instances=len(instances),
         scores=scores,
         reference=held_against,
-        baseline=(baseline, comparable[baseline]),
+        baseline=_baseline(baseline, scores, settings.view, held_against),
     )
+
+
+def _baseline(
+    name: str | None, scores: Mapping[str, Scores], view: Any, reference: tuple[str, Scores] | None
+) -> tuple[str, Any, Scores]:
+    """Name, view and scores of what differences are taken to; no name means the reference under the full view."""
+    if name is None and reference is not None:
+        return reference[0], None, reference[1]
+    name = next(iter(scores)) if name is None else name
+    return name, view, scores[name]
 
 
 def _mean(values: np.ndarray) -> float | None:

@@ -38,7 +38,11 @@ class Selection:
     ] = None
     baseline: Annotated[
         str | None,
-        typer.Option("--baseline", help="What paired differences are taken to (default: what M2 is the gain over)."),
+        typer.Option(
+            "--baseline",
+            help="The one of --schedulers that paired differences are taken to, under the same view "
+            "(default: what M2 is the gain over, with the full view).",
+        ),
     ] = None
     view: options.View = "full"
     reach: options.Reach = None

@@ -17,9 +17,9 @@ def print_scores(results: dict[str, Any]) -> None:
     console = Console()
     measures = [name for name in _other_measures(results) if console.width >= _WIDE or name in _ALWAYS]
     table = Table(title=_title(results), caption=_caption(results), show_lines=False, box=box.SIMPLE_HEAD)
-    table.add_column("scheduler", overflow="fold")
+    table.add_column("scheduler", no_wrap=True)
     gain = ["M2 %"] if "reference" in results else []
-    for heading in ("M1", "IQM", f"less {results['baseline']}", *gain, *measures):
+    for heading in ("M1", "IQM", "difference", *gain, *measures):
         table.add_column(heading, justify="right", min_width=7, overflow="fold")
     lower = results["better"] == "lower"
     for name, row in sorted(results["schedulers"].items(), key=lambda item: item[1]["M1"]["mean"], reverse=not lower):
@@ -31,8 +31,16 @@ def print_scores(results: dict[str, Any]) -> None:
         ]
         cells += [f"{row[name]['mean']:.1f}\n± {row[name]['std']:.1f}" for name in ("M2",) if gain]
         cells += [f"{row[measure]['mean']:.4f}\n± {row[measure]['std']:.3f}" for measure in measures]
-        table.add_row(f"{name}\n({row['needs']})" if row["needs"] else name, *cells)
+        table.add_row("\n".join([name, *_notes(results, row)]), *cells)
     console.print(table)
+
+
+def _notes(results: dict[str, Any], row: dict[str, Any]) -> list[str]:
+    """What stands below a scheduler's name: what it needs, and whether a local view showed too much to be one."""
+    notes = [f"({row['needs']})"] if row["needs"] else []
+    if results["view"]["kind"] != "full" and not row["local"]:
+        notes.append(f"(sees {100 * row['visible_share']:.0f} %: not local)")
+    return notes
 
 
 def _title(results: dict[str, Any]) -> str:
@@ -48,11 +56,14 @@ def horizon(results: dict[str, Any]) -> str:
 
 def _caption(results: dict[str, Any]) -> str:
     view = dict(results["view"])
-    kind, share = view.pop("kind"), view.pop("visible_share")
+    kind, share, local = view.pop("kind"), view.pop("visible_share"), view.pop("local")
     seen = " ".join([kind, *(f"{name} {value}" for name, value in view.items())])
+    baseline = results["baseline"]
     return (
         f"{results['instances']} instances x {results['episodes']} episodes, seed {results['seed']}; view {seen}, "
-        f"{100 * share:.0f} % of the graph seen. ±: over instances; [ ]: 95 percent intervals, of the difference paired"
+        f"{100 * share:.0f} % of the graph seen{'' if local or kind == 'full' else ', too much to be local'}. "
+        f"difference: paired, to {baseline['scheduler']} with the {baseline['view']['kind']} view. "
+        "±: over instances; [ ]: 95 percent intervals"
     )
 
 

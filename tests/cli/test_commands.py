@@ -133,7 +133,8 @@ def test_the_options_of_the_view_reach_the_simulator(run, tmp_path):
     view = ("--view", "local", "--reach", 0, "--comm", 2, "--staleness", 4)
     run("evaluate", "--schedulers", "condition", *SHORT, *view, "--json", tmp_path / "r.json")
     seen = json.loads((tmp_path / "r.json").read_text())["view"]
-    share = seen.pop("visible_share")
+    share, local = seen.pop("visible_share"), seen.pop("local")
+    assert local
     assert seen == {"kind": "local", "reach": 0, "comm": 2, "staleness": 4}
     assert 1 / 8 - 0.03 < share < 1 / 6 + 0.03  # one sector of six to eight
 
@@ -144,11 +145,31 @@ def test_the_objective_and_the_baseline_are_taken(run, tmp_path):
     results = json.loads((tmp_path / "r.json").read_text())
     assert (results["objective"], results["baseline"], results["options"]) == (
         "revenue",
-        "random",
+        {"scheduler": "random", "view": {"kind": "full"}},
         {"failure": "hazard"},
     )
     assert results["schedulers"]["random"]["difference"]["mean"] == 0
     assert results["schedulers"]["condition"]["difference"]["to"] == "random"
+
+
+def test_the_table_keeps_names_whole_on_a_narrow_terminal(run, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    out = run("evaluate", "--schedulers", "corrective-published,preventive-first", *SHORT).out
+    assert "corrective-published " in out
+    assert max(len(line) for line in out.splitlines()) <= 80
+    assert "difference: paired, to corrective-published with the full view" in " ".join(out.split())
+
+
+def test_a_local_view_that_shows_too_much_is_marked(run, tmp_path):
+    arguments = ("evaluate", "--schedulers", "condition", *SHORT, "--view", "local", "--reach")
+    far = run(*arguments, 2, "--json", tmp_path / "far.json")
+    near = run(*arguments, 0, "--json", tmp_path / "near.json")
+    for ended, name, local in ((far, "far", False), (near, "near", True)):
+        results = json.loads((tmp_path / f"{name}.json").read_text())
+        row = results["schedulers"]["condition"]
+        assert results["view"]["local"] is row["local"] is local is (row["visible_share"] <= 0.45)
+        assert ("not local)" in ended.out) is not local
+        assert ("too much to be local" in " ".join(ended.out.split())) is not local
 
 
 def test_compare_writes_results_and_pictures(run, tmp_path):

@@ -102,7 +102,7 @@ def test_a_table_worked_out_by_hand():
         n_instances=2,
         scores={"better": better},
         reference=("plain", reference),
-        baseline=("plain", reference),
+        baseline=("plain", None, reference),
     ).as_json()
     row = table["schedulers"]["better"]
     assert row["M1"]["mean"] == pytest.approx(0.6)
@@ -114,7 +114,7 @@ def test_a_table_worked_out_by_hand():
     assert row["difference"]["mean"] == pytest.approx(0.1)
     assert row["difference"]["std"] == pytest.approx(0.1)
     assert table["reference"]["M1"]["mean"] == pytest.approx(0.5)
-    assert table["view"] == {"kind": "local", "reach": 2, "comm": 1, "staleness": 0, "visible_share": 0.25}
+    assert table["view"] == {"kind": "local", "reach": 2, "comm": 1, "staleness": 0, "visible_share": 0.25, "local": True}
 
 
 def test_the_table_has_the_keys_that_other_tools_read():
@@ -127,7 +127,7 @@ def test_the_table_has_the_keys_that_other_tools_read():
         "airme",
         "small",
         "profit",
-        {"kind": "full", "visible_share": 1.0},
+        {"kind": "full", "visible_share": 1.0, "local": False},
         3,
         2,
         DAYS,
@@ -162,6 +162,35 @@ def test_the_gain_is_taken_to_the_reference_under_the_full_view_whatever_the_vie
     assert local["reference"] == full["reference"]
     assert full["schedulers"]["corrective-published"]["M2"]["mean"] == 0.0
     assert local["schedulers"]["corrective-published"]["M2"]["mean"] != 0.0
+
+
+def test_the_default_baseline_is_the_full_view_reference_whatever_else_is_in_the_table():
+    published, blind = RULES["corrective-published"](), settings(view=LocalView(reach=0, comm=0))
+    alone = {"condition": RULES["condition"]()}
+    tables = [
+        evaluate(AIRME, rules, fleets(), blind, reference=published).as_json()
+        for rules in (alone, {**alone, "corrective-published": published})
+    ]
+    for table in tables:
+        assert table["baseline"] == {"scheduler": "corrective-published", "view": {"kind": "full"}}
+    assert tables[0]["schedulers"]["condition"]["difference"] == tables[1]["schedulers"]["condition"]["difference"]
+    assert tables[1]["schedulers"]["corrective-published"]["difference"]["mean"] != 0.0
+
+
+def test_a_named_baseline_plays_under_the_view_of_the_table():
+    published, blind = RULES["corrective-published"](), settings(view=LocalView(reach=0, comm=0))
+    rules = {"condition": RULES["condition"](), "corrective-published": published}
+    table = evaluate(AIRME, rules, fleets(), blind, reference=published, baseline="corrective-published").as_json()
+    assert table["baseline"]["view"] == {"kind": "local", "reach": 0, "comm": 0, "staleness": 0}
+    row = table["schedulers"]["corrective-published"]
+    assert row["difference"]["mean"] == 0.0
+    assert row["M2"]["mean"] != 0.0
+
+
+def test_a_reference_outside_the_table_is_no_baseline_by_name():
+    rules, published = {"condition": RULES["condition"]()}, RULES["corrective-published"]()
+    with pytest.raises(UnknownNameError, match="Known: condition"):
+        evaluate(AIRME, rules, fleets(), settings(), reference=published, baseline=published.name)
 
 
 def test_a_baseline_that_does_not_play_is_refused():
@@ -234,7 +263,7 @@ def test_the_gap_to_the_exact_solver_is_in_percent_of_its_score():
         n_instances=2,
         scores=scores,
         reference=None,
-        baseline=("exact", scores["exact"]),
+        baseline=("exact", None, scores["exact"]),
     ).as_json()
     assert table["schedulers"]["quick"]["gap_to_exact"]["mean"] == pytest.approx(10.0)
     assert table["schedulers"]["exact"]["gap_to_exact"]["mean"] == 0.0
