@@ -7,7 +7,7 @@ policy can be rebuilt without its domain, and is refused where a domain's graph 
 from __future__ import annotations
 
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,18 +16,21 @@ from msgspec import Meta, Struct
 
 from marl_sched.errors import InvalidFileError
 from marl_sched.files import read_json, write_json
-from marl_sched.graph import STATE, GraphSpec
+from marl_sched.graph import DECISION, STATE, GraphSpec, Relation
 
 SCHEMA = 1
-Positive = Annotated[int, Meta(ge=1)]
+# Far beyond what a scheduler of a few hundred nodes can use; a damaged card shall not ask for terabytes.
+Width = Annotated[int, Meta(ge=1, le=1024)]
+Heads = Annotated[int, Meta(ge=1, le=64)]
+Layers = Annotated[int, Meta(ge=1, le=32)]
 
 
 class Sizes(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Sizes of a HetGAT network: features per head, heads per layer, layers."""
 
-    width: Positive
-    heads: Positive
-    layers: Positive
+    width: Width
+    heads: Heads
+    layers: Layers
 
 
 class PolicyCard(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -71,11 +74,55 @@ def write_card(path: str | Path, card: PolicyCard) -> None:
 def read_card(path: str | Path) -> PolicyCard:
     """The card in a JSON file; InvalidFileError names the field that is not as expected."""
     try:
-        return msgspec.convert(read_json(path), PolicyCard)
+        card = msgspec.convert(read_json(path), PolicyCard)
     except msgspec.ValidationError as error:
         reason, _, where = str(error).partition(" - at `$")
         field = where.strip("`.") or "card"
         raise InvalidFileError(path, field, f"a policy card of schema {SCHEMA} ({reason})") from error
+    if not isinstance(card.view.get("kind"), str):
+        raise InvalidFileError(path, "view.kind", "the name of a view", card.view.get("kind"))
+    _check_names(path, card.graph)
+    for i, relation in enumerate(card.graph.relations):
+        _check_relation(path, f"graph.relations[{i}]", relation, [node.name for node in card.graph.nodes])
+    keys = [relation.key for relation in card.graph.relations]
+    _require_distinct(path, "graph.relations", keys)
+    return card
+
+
+def _check_names(path: str | Path, graph: GraphSpec) -> None:
+    """Raise InvalidFileError unless nodes and features have distinct names and decisions are on one of the nodes."""
+    names = [node.name for node in graph.nodes]
+    if not names:
+        raise InvalidFileError(path, "graph.nodes", "at least one node type", [])
+    for i, name in enumerate(names):
+        if not name.isidentifier() or name in (STATE, DECISION):
+            expected = f"an identifier other than {STATE!r} and {DECISION!r}"
+            raise InvalidFileError(path, f"graph.nodes[{i}].name", expected, name)
+    _require_distinct(path, "graph.nodes", names)
+    features = {f"graph.nodes[{i}].features": node.features for i, node in enumerate(graph.nodes)}
+    for field, listed in {**features, "graph.state_features": graph.state_features}.items():
+        if not listed:
+            raise InvalidFileError(path, field, "at least one feature", [])
+        _require_distinct(path, field, listed)
+    if graph.decision_of not in names:
+        raise InvalidFileError(path, "graph.decision_of", f"one of the node types {names}", graph.decision_of)
+
+
+def _check_relation(path: str | Path, field: str, relation: Relation, nodes: list[str]) -> None:
+    """Raise InvalidFileError unless both ends exist and what the pattern reads is named."""
+    for end in ("source", "target"):
+        if getattr(relation, end) not in (known := [*nodes, STATE, DECISION]):
+            raise InvalidFileError(path, f"{field}.{end}", f"one of {known}", getattr(relation, end))
+    if not relation.name.isidentifier():
+        raise InvalidFileError(path, f"{field}.name", "an identifier", relation.name)
+    if relation.pattern in ("scatter", "gather") and not relation.index:
+        raise InvalidFileError(path, f"{field}.index", f"an index array for the pattern {relation.pattern!r}")
+
+
+def _require_distinct(path: str | Path, field: str, names: Sequence[str]) -> None:
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise InvalidFileError(path, field, "distinct names", twice[0])
 
 
 def check_graph(path: str | Path, card: PolicyCard, graph: GraphSpec) -> None:

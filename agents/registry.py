@@ -1,7 +1,8 @@
 """Schedulers by name: a domain's rules, the policies that ship with the package, and checkpoints by path.
 
 A domain's rules stand in one table, `RULES` (name -> factory), in `marl_sched.agents.<domain>_rules`, which is
-imported when it is asked for. PyTorch is imported only when a policy is loaded.
+imported when it is asked for; where instances may be infeasible, `IS_FEASIBLE` there tells. PyTorch is imported only
+when a policy is loaded.
 """
 
 from __future__ import annotations
@@ -34,6 +35,14 @@ def rules(domain: str) -> Mapping[str, Callable[..., Scheduler]]:
     return import_module(module).RULES
 
 
+def feasibility(domain: str) -> Callable[[Any], bool] | None:
+    """What tells whether an instance is feasible: `IS_FEASIBLE` beside the domain's rules; None: nothing."""
+    module = f"marl_sched.agents.{domain}_rules"
+    if find_spec(module) is None:
+        return None
+    return getattr(import_module(module), "IS_FEASIBLE", None)
+
+
 @cache
 def shipped_policies() -> Mapping[str, PolicyCard]:
     """The cards of the policies that ship with the package, by name, sorted."""
@@ -60,7 +69,8 @@ def create_scheduler(name_or_path: str | Path, domain: Domain | str, **options: 
         raise UnknownNameError("scheduler", str(name_or_path), scheduler_names(domain_name))
     policy = load_policy(name_or_path, **options)
     if policy.card is not None and policy.card.domain != domain_name:
-        raise InvalidFileError(name_or_path, "domain", f"a policy for {domain_name}", policy.card.domain)
+        card_path = Path(name_or_path).with_suffix(".json")
+        raise InvalidFileError(card_path, "domain", f"a policy for {domain_name}", policy.card.domain)
     return policy
 
 

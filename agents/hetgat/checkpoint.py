@@ -7,6 +7,7 @@ from pathlib import Path
 
 import msgspec
 import safetensors.torch
+import torch
 from safetensors import SafetensorError
 from torch import Tensor
 
@@ -37,14 +38,15 @@ def load_network(path: str | Path) -> tuple[HetGATNetwork, PolicyCard]:
     """
     weights_path, card_path = Path(path).with_suffix(".safetensors"), Path(path).with_suffix(".json")
     card = read_card(card_path)
-    network = HetGATNetwork(card.graph, **msgspec.structs.asdict(card.sizes))
+    with torch.device("meta"):  # shapes without memory, until they are known to be those of the weights
+        network = HetGATNetwork(card.graph, **msgspec.structs.asdict(card.sizes))
     weights = _read_weights(weights_path, card)
     expected = network.state_dict()
-    for name in expected.keys() | weights.keys():
+    for name in sorted(expected.keys() | weights.keys()):
         want, got = _shape(expected.get(name)), _shape(weights.get(name))
         if want != got:
             raise InvalidFileError(weights_path, name, want, got)
-    network.load_state_dict(weights)
+    network.to_empty(device="cpu").load_state_dict(weights)
     return network, card
 
 

@@ -62,7 +62,7 @@ class HetGATPolicy(ObservationScheduler):
         """
         network, card = load_network(path)
         if graph is not None:
-            check_graph(path, card, graph)
+            check_graph(Path(path).with_suffix(".json"), card, graph)
         return cls(network, name=Path(path).stem, mode=mode, card=card)
 
     def decide(self, simulator: TurnSimulator) -> np.ndarray:
@@ -72,7 +72,7 @@ class HetGATPolicy(ObservationScheduler):
         """
         if simulator.graph is not self._checked:
             if self.card is not None:
-                check_graph(self.name, self.card, simulator.graph)
+                check_graph(f"{self.name}.json", self.card, simulator.graph)
             self._checked = simulator.graph
         return super().decide(simulator)
 

@@ -15,6 +15,8 @@ from marl_sched.agents.cards import PolicyCard, Sizes, check_graph, read_card, s
 from marl_sched.agents.hetgat.checkpoint import load_network, save_network
 from marl_sched.agents.hetgat.network import HetGATNetwork
 from marl_sched.agents.hetgat.policy import HetGATPolicy
+from marl_sched.agents.registry import create_scheduler
+from marl_sched.domain import domain_names, get_domain
 from marl_sched.errors import InvalidFileError
 from marl_sched.graph import NodeType
 
@@ -121,6 +123,93 @@ def test_a_malformed_card_names_the_field(saved, change, message: str):
         read_card(card)
 
 
+def decide_on_nothing(card):
+    card["graph"]["decision_of"] = "xx"
+
+
+def no_nodes(card):
+    card["graph"]["nodes"] = []
+
+
+def unknown_source(card):
+    card["graph"]["relations"][0]["source"] = "xx"
+
+
+def unknown_target(card):
+    card["graph"]["relations"][-1]["target"] = "xx"
+
+
+def same_node_twice(card):
+    card["graph"]["nodes"].append(card["graph"]["nodes"][0])
+
+
+def same_relation_twice(card):
+    card["graph"]["relations"].append(card["graph"]["relations"][0])
+
+
+def no_features(card):
+    card["graph"]["nodes"][0]["features"] = []
+
+
+def name_with_a_dot(card):
+    card["graph"]["nodes"][0]["name"] = "a.b"
+
+
+def scatter_without_index(card):
+    card["graph"]["relations"][0] |= {"pattern": "scatter", "index": None}
+
+
+def enormous(card):
+    card["sizes"]["width"] = 10**9
+
+
+def no_view(card):
+    card["view"] = {}
+
+
+@pytest.mark.parametrize(
+    ("damage", "field"),
+    [
+        (decide_on_nothing, r"graph\.decision_of: expected one of .*got 'xx'"),
+        (no_nodes, r"graph\.nodes: expected at least one"),
+        (unknown_source, r"graph\.relations\[0\]\.source: .*got 'xx'"),
+        (unknown_target, r"graph\.relations\[\d+\]\.target: .*got 'xx'"),
+        (same_node_twice, r"graph\.nodes: expected distinct names"),
+        (same_relation_twice, r"graph\.relations: expected distinct names"),
+        (no_features, r"graph\.nodes\[0\]\.features: expected at least one"),
+        (name_with_a_dot, r"graph\.nodes\[0\]\.name: .*got 'a\.b'"),
+        (scatter_without_index, r"graph\.relations\[0\]\.index: expected an index array"),
+        (enormous, r"sizes\.width: "),
+        (no_view, r"view\.kind: expected the name of a view"),
+    ],
+)
+def test_a_card_that_contradicts_itself_is_refused_by_file_and_field(saved, damage, field: str):
+    card = saved.with_suffix(".json")
+    content = json.loads(card.read_text())
+    damage(content)
+    card.write_text(json.dumps(content))
+    with pytest.raises(InvalidFileError, match=r"mine\.json: " + field):
+        load_network(saved)
+
+
+def test_the_largest_sizes_are_compared_with_the_weights_before_memory_is_asked_for(saved):
+    card = saved.with_suffix(".json")
+    content = json.loads(card.read_text())
+    content["sizes"] = {"width": 1024, "heads": 64, "layers": 32}  # would take terabytes
+    card.write_text(json.dumps(content))
+    with pytest.raises(InvalidFileError, match=r"mine\.safetensors: .*expected torch.float32 of shape"):
+        load_network(saved)
+
+
+@pytest.mark.parametrize("domain", domain_names())
+def test_the_graph_of_every_domain_makes_a_card_that_is_read(domain: str, tmp_path):
+    known = get_domain(domain)
+    spec = known.simulator(known.instances(next(iter(known.scales)), 1, 0)).graph
+    network = HetGATNetwork(spec, width=2, heads=1, layers=1)
+    save_network(tmp_path / "mine.safetensors", network, card_of(network))
+    assert load_network(tmp_path / "mine.json")[1].graph == spec
+
+
 def test_a_card_of_other_sizes_than_the_weights_names_the_tensor(saved):
     card = saved.with_suffix(".json")
     content = json.loads(card.read_text())
@@ -144,3 +233,13 @@ def test_a_policy_for_other_relations_is_refused(network, saved):
     with pytest.raises(InvalidFileError, match="relations: expected those of the environment's graph"):
         HetGATPolicy.load(saved, graph=fewer)
     check_graph(saved, read_card(saved.with_suffix(".json")), network.spec)
+
+
+def test_a_policy_of_another_domain_is_refused_by_its_card(saved):
+    for path in (saved, saved.with_suffix(".json")):
+        with pytest.raises(InvalidFileError, match=r"mine\.json: domain: expected a policy for murse, got 'airme'"):
+            create_scheduler(path, "murse")
+    murse = get_domain("murse")
+    simulator = murse.simulator(murse.instances("small", 1, 0))
+    with pytest.raises(InvalidFileError, match=r"^mine\.json: "):
+        HetGATPolicy.load(saved).decide(simulator)
