@@ -114,7 +114,14 @@ def test_a_table_worked_out_by_hand():
     assert row["difference"]["mean"] == pytest.approx(0.1)
     assert row["difference"]["std"] == pytest.approx(0.1)
     assert table["reference"]["M1"]["mean"] == pytest.approx(0.5)
-    assert table["view"] == {"kind": "local", "reach": 2, "comm": 1, "staleness": 0, "visible_share": 0.25, "local": True}
+    assert table["view"] == {
+        "kind": "local",
+        "reach": 2,
+        "comm": 1,
+        "staleness": 0,
+        "visible_share": 0.25,
+        "local": True,
+    }
 
 
 def test_the_table_has_the_keys_that_other_tools_read():
