@@ -62,6 +62,8 @@ def save_checkpoint(
     collector: Mapping[str, np.ndarray],
 ) -> None:
     """Write networks, optimizer, the states of estimator and collector, and the counters."""
+    if not ppo.optimizer.state:  # before the first update
+        _prepare(ppo)
     tensors = {f"{_COLLECTOR}{name}": torch.from_numpy(array) for name, array in collector.items()}
     tensors |= _learned(ppo)
     name = f"checkpoint-{counters.update:06d}.safetensors"

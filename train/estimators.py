@@ -90,7 +90,7 @@ class CriticEstimator:
 
 
 class StepBaseline:
-    """The dissertation's baseline: the mean return of the other episodes of the instance at the same time."""
+    """The dissertation's baseline: the mean return of all episodes of the instance, its own too, at the same time."""
 
     def __init__(self, *, discount: float, episodes: int) -> None:
         self._discount, self._episodes = discount, episodes

@@ -36,9 +36,10 @@ def train_from_overrides(overrides: Sequence[str], *, quiet: bool = False) -> Pa
     if (directory / CONFIG).exists():
         raise InvalidOptionError(f"run_dir: {directory} holds a run already; resume it or choose another")
     record = RunRecord(config=config, overrides=list(overrides), revision=source_revision())
-    parts = build(record)
+    parts, counters = build(record), Counters()
+    parts.save(counters, directory)  # first, so that whatever holds a run can be resumed
     write_json(directory / CONFIG, msgspec.to_builtins(record))
-    return train(parts, Counters(), directory, quiet=quiet)
+    return train(parts, counters, directory, quiet=quiet)
 
 
 def resume(run_dir: str | Path, *, quiet: bool = False) -> Path:

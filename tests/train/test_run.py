@@ -70,6 +70,25 @@ def test_a_resumed_run_ends_as_one_that_never_stopped(
     assert (whole / "policy.safetensors").read_bytes() == (halved / "policy.safetensors").read_bytes()
 
 
+@pytest.mark.parametrize("overrides", [GAE, STEP_BASELINE], ids=["gae", "step_baseline"])
+def test_a_run_that_stopped_before_its_first_update_is_resumed_from_the_start(
+    overrides: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
+    train_from_overrides([*overrides, "updates=2", f"run_dir={whole}"], quiet=True)
+    with monkeypatch.context() as patch:
+        stop_in_update(patch, 1)
+        with pytest.raises(StoppedError):
+            train_from_overrides([*overrides, "updates=2", f"run_dir={stopped}"], quiet=True)
+    assert read_json(stopped / "checkpoint.json")["counters"]["update"] == 0
+    resume(stopped, quiet=True)
+    expected, found = checkpoint(whole), checkpoint(stopped)
+    assert expected.keys() == found.keys()
+    for name, tensor in expected.items():
+        assert np.array_equal(tensor, found[name]), name
+    assert rows(whole) == rows(stopped)
+
+
 def test_learning_changes_the_weights_and_seeds_change_the_run(tmp_path: Path):
     runs = {}
     for seed in (0, 1):
