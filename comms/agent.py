@@ -174,9 +174,12 @@ class Agent:
                 return said if said.incarnation == self._incarnation and said.agent == self.agent else None
             self._learn(event.key, wire.decode(event.payload, wire.News))
         except InvalidMessageError as error:
-            self.counts["unparsed"] += 1
-            log.warning("dropped a message on %s: %s", event.key, error)
+            self._drop(event.key, error)
         return None
+
+    def _drop(self, key: str, error: InvalidMessageError) -> None:
+        self.counts["unparsed"] += 1
+        log.warning("dropped a message on %s: %s", key, error)
 
     def _learn(self, channel: str, news: wire.News) -> None:
         """Believe the news of a channel unless newer ones are known."""
@@ -190,7 +193,10 @@ class Agent:
         snapshot = wire.decode(self._ask(wire.SNAPSHOT, request), wire.Snapshot)
         self.counts["snapshots"] += 1
         for channel, news in snapshot.channels.items():
-            self._learn(channel, news)
+            try:
+                self._learn(channel, news)
+            except InvalidMessageError as error:
+                self._drop(f"{wire.SNAPSHOT}, {channel}", error)
         return snapshot.clock.phase == "over"
 
     def _lacks(self, turn: wire.Turn) -> bool:

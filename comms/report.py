@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from marl_sched.comms.messages import kind_of
+from marl_sched.comms.roster import most_misses
 
 if TYPE_CHECKING:
     from marl_sched.comms.options import WorldOptions
@@ -103,7 +104,12 @@ def build(
         "objectives": objectives,
         **series,
         "agents": [
-            {"name": domain.agent_name(i), "policy": seat.policy, "turns": seat.turns}
+            {
+                "name": domain.agent_name(i),
+                "policy": seat.policy,
+                "turns": seat.turns,
+                "waited_s": round(seat.waited_in_all, 4),
+            }
             for i, seat in enumerate(roster.seats)
         ],
         "decisions": books.decisions,
@@ -115,6 +121,8 @@ def build(
         "events": books.events,
         "run": options.run,
         "deadline_s": options.deadline,
-        "delay_bound_s": options.deadline * options.patience,  # by which a dead agent may delay the others in all
+        # The most that one agent, dead, slow or returning, delays the others in vain between two of its decisions in
+        # time, in all its incarnations together; the milliseconds that the world takes to notice come on top.
+        "delay_bound_s": round(options.deadline * most_misses(options.patience), 6),
         "seconds": round(seconds, 3),
     }

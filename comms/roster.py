@@ -12,8 +12,9 @@ class Seat:
     Attributes:
         incarnation: the process that the world counts on, "" while there is none.
         policy: what decides for it, as the agent says.
-        missed: deadlines missed in a row.
-        waited: seconds that the others waited for it in vain, since its last decision.
+        missed: turns in a row that the others waited for in vain, in however many incarnations.
+        waited: seconds that they waited, since its last decision in time.
+        waited_in_all: seconds that they waited in vain in the whole run.
         turns: turns given so far, the sequence of the last one.
         fenced: incarnations that the world will not count on again.
     """
@@ -22,12 +23,23 @@ class Seat:
     policy: str = ""
     missed: int = 0
     waited: float = 0.0
+    waited_in_all: float = 0.0
     turns: int = 0
     fenced: set[str] = field(default_factory=set)
 
 
+def most_misses(patience: int) -> int:
+    """Turns in a row for which one agent can make the others wait in vain: at most `patience` successors try again."""
+    return 2 * patience
+
+
 class Roster:
-    """The seats of all agents. Pure bookkeeping: it neither sends nor waits."""
+    """The seats of all agents. Pure bookkeeping: it neither sends nor waits.
+
+    After `patience` misses in a row an incarnation is given up. Its successors inherit the misses: each is given up
+    at its first miss, and after `most_misses(patience)` in a row nobody is admitted any more. A decision in time
+    clears the seat's misses.
+    """
 
     def __init__(self, n_agents: int, patience: int) -> None:
         self.seats = [Seat() for _ in range(n_agents)]
@@ -48,7 +60,8 @@ class Roster:
             return "this incarnation has been declared dead"
         if seat.incarnation:
             return "another process decides for this agent"
-        seat.missed, seat.waited = 0, 0.0
+        if seat.missed >= most_misses(self._patience):
+            return f"its {seat.missed} turns in a row were waited for in vain, it is not asked again"
         seat.incarnation, seat.policy = incarnation, policy
         return ""
 
@@ -62,10 +75,11 @@ class Roster:
         return True
 
     def miss(self, agent: int, waited: float) -> bool:
-        """Note a missed deadline, `waited` seconds after the turn; True if it was one too many."""
+        """Note a turn that was waited for in vain for `waited` seconds; True if it was one too many."""
         seat = self.seats[agent]
         seat.missed += 1
         seat.waited += waited
+        seat.waited_in_all += waited
         return seat.missed >= self._patience
 
     def answered(self, agent: int) -> None:

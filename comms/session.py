@@ -22,6 +22,10 @@ from marl_sched.comms.messages import run_prefix
 from marl_sched.errors import DeploymentError, InvalidOptionError
 
 LEASE_MS = 1000
+# An hour's states go out in one burst. By default Zenoh drops what finds two batches in its queue for a millisecond,
+# which on busy cores lost states, and every lost one cost its reader a resent turn and a snapshot.
+QUEUE = 16  # batches, the most that Zenoh takes
+DROP_AFTER_US = 50_000
 CONNECT_SLICE = 1.0  # seconds for which an attempt to connect may keep a process from hearing signals
 _ENDPOINT = re.compile(r"tcp/(?P<host>[^\s/:]+|\[[0-9a-fA-F:]+\]):(?P<port>\d{1,5})")
 EventKind = Literal["message", "alive", "gone", "query"]
@@ -145,7 +149,7 @@ def hub(run: str, endpoint: str) -> Iterator[Link]:
         session = zenoh.open(_config(mode="peer", listen={"endpoints": [endpoint]}))
     except zenoh.ZError as error:
         in_use = "address already in use" in str(error).lower()
-        why = "the port is in use" if in_use else str(error).split(" at /")[0]
+        why = "the port is in use" if in_use else _plain(error)
         raise DeploymentError(f"cannot listen on {endpoint}: {why}") from error
     with session:
         yield Link(session, run)
@@ -156,28 +160,45 @@ def spoke(run: str, endpoint: str, timeout: float) -> Iterator[Link]:
     """An agent's session, connected to the world's endpoint; waits up to `timeout` seconds for it."""
     check_endpoint("connect", endpoint)
     end = time.monotonic() + timeout
-    while (session := _connect(endpoint, min(CONNECT_SLICE, end - time.monotonic()))) is None:
+    while isinstance(session := _connect(endpoint, min(CONNECT_SLICE, end - time.monotonic())), zenoh.ZError):
         if time.monotonic() >= end:
-            raise DeploymentError(f"no world at {endpoint} within {timeout:g} s")
+            raise DeploymentError(
+                f"no world at {endpoint} within {timeout:g} s: {_why(endpoint, session)}"
+            ) from session
     with session:
         yield Link(session, run)
 
 
-def _connect(endpoint: str, seconds: float) -> zenoh.Session | None:
-    """A session connected to an endpoint, None if there was no answer in time. Signals wait for it to return."""
+def _connect(endpoint: str, seconds: float) -> zenoh.Session | zenoh.ZError:
+    """A session connected to an endpoint, or why there was none in time. Signals wait for it to return."""
     retry = {"period_init_ms": 100, "period_max_ms": 400, "period_increase_factor": 2.0}
     timeout_ms = max(int(seconds * 1000), 1)
     connect = {"endpoints": [endpoint], "timeout_ms": timeout_ms, "exit_on_failure": True, "retry": retry}
     try:
         return zenoh.open(_config(mode="client", connect=connect))
-    except zenoh.ZError:
-        return None
+    except zenoh.ZError as error:
+        return error
+
+
+def _why(endpoint: str, error: zenoh.ZError) -> str:
+    """Why a connection failed: what the system says of the endpoint, as Zenoh only says that it timed out."""
+    try:
+        with socket.create_connection(check_endpoint("connect", endpoint), CONNECT_SLICE):
+            return _plain(error)
+    except OSError as obstacle:
+        return f"{obstacle.strerror or obstacle} ({_plain(error)})"
+
+
+def _plain(error: zenoh.ZError) -> str:
+    """What Zenoh says, without the places in its source."""
+    return re.sub(r" at /\S+:\d+\.?", "", str(error)).strip()
 
 
 def _config(**sections: Any) -> zenoh.Config:
     config = zenoh.Config()
     off = {"multicast": {"enabled": False}, "gossip": {"enabled": False}, "delay": 0}
-    transport = {"shared_memory": {"enabled": False}, "link": {"tx": {"lease": LEASE_MS}}}
+    queues = {"size": {"data": QUEUE}, "congestion_control": {"drop": {"wait_before_drop": DROP_AFTER_US}}}
+    transport = {"shared_memory": {"enabled": False}, "link": {"tx": {"lease": LEASE_MS, "queue": queues}}}
     for key, value in _leaves({**sections, "scouting": off, "transport": transport}):
         config.insert_json5(key, json.dumps(value))
     return config

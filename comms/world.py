@@ -165,6 +165,7 @@ class World:
                 self.roster.answered(agent)
                 return decision.target, DECIDED
             self._note_stale(decision)
+        self.roster.miss(agent, time.monotonic() - start)  # it went with its turn open
         return IDLE, ABSENT
 
     def _note_stale(self, decision: wire.Decision | None) -> None:

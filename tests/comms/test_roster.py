@@ -1,5 +1,10 @@
 """The world counts on one incarnation per agent, and never again on one that it gave up."""
 
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
 from marl_sched.comms.roster import Roster
 
 
@@ -53,3 +58,41 @@ def test_hello_that_is_repeated_does_not_renew_patience():
     roster.miss(0, 0.5)
     assert roster.admit(0, "a", "condition") == ""
     assert roster.miss(0, 0.5)
+
+
+def test_successor_of_a_silent_incarnation_is_given_up_at_its_first_miss():
+    roster = Roster(1, patience=2)
+    roster.admit(0, "a", "condition")
+    roster.miss(0, 0.5)
+    assert roster.miss(0, 0.5)
+    roster.bury(0, "a")
+    assert roster.admit(0, "b", "condition") == ""
+    assert roster.miss(0, 0.5)
+    assert roster.seats[0].waited == 1.5
+
+
+def test_decision_in_time_gives_a_successor_all_patience_again():
+    roster = Roster(1, patience=2)
+    roster.seats[0].missed = 3
+    roster.admit(0, "b", "condition")
+    roster.answered(0)
+    assert not roster.miss(0, 0.5)
+
+
+@given(patience=st.integers(1, 4), fates=st.lists(st.sampled_from(["late", "gone", "answers", "hello"]), max_size=60))
+def test_nobody_is_waited_for_in_vain_more_than_twice_patience_times_between_two_decisions(patience, fates):
+    roster, incarnations, in_vain = Roster(1, patience), 0, 0
+    seat = roster.seats[0]
+    for fate in fates:
+        if not seat.incarnation:
+            incarnations += 1
+            refused = roster.admit(0, str(incarnations), "condition")
+            assert bool(refused) == (in_vain == 2 * patience)
+        elif fate == "answers":
+            roster.answered(0)
+            in_vain = 0
+        elif fate in ("late", "gone"):
+            in_vain += 1
+            if roster.miss(0, 1.0) or fate == "gone":
+                roster.bury(0, seat.incarnation)
+        assert seat.waited == in_vain <= 2 * patience
