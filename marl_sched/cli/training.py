@@ -1,4 +1,4 @@
-"""`marl-sched train` and `resume`: policies learn."""
+"""`marl-sched train`, `resume` and `export`: policies learn and are measured."""
 
 from __future__ import annotations
 
@@ -7,11 +7,17 @@ from typing import Annotated
 
 import typer
 
+from marl_sched.cli import options
+from marl_sched.errors import InvalidOptionError
+
+EXPORT_SEED = 90_002  # of instances that neither training nor validation draws
+
 
 def add_to(app: typer.Typer) -> None:
     """Register this file's commands."""
     app.command(epilog="Example: marl-sched train env=airme view=local view.reach=1 algorithm=gae seed=1")(train)
     app.command(epilog="Example: marl-sched resume runs/airme-local")(resume)
+    app.command(epilog="Example: marl-sched export runs/airme-local airme-local-profit --out policies")(export)
 
 
 def train(
@@ -30,3 +36,28 @@ def resume(run_dir: Annotated[Path, typer.Argument(metavar="RUN_DIR", help="The 
     from marl_sched.train.run import resume as go_on
 
     typer.echo(go_on(run_dir))
+
+
+def export(
+    run_dir: Annotated[Path, typer.Argument(metavar="RUN_DIR", help="The folder of a run.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="What the policy will be called.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for NAME.safetensors and NAME.json.")],
+    instances: Annotated[int, typer.Option("--instances", min=1, help="Generated instances of each scale.")] = 100,
+    episodes: Annotated[int, typer.Option("--episodes", min=1, help="Episodes of each instance.")] = 10,
+    seed: options.Seed = EXPORT_SEED,
+    length: Annotated[
+        int | None,
+        typer.Option("--length", min=1, help="Simulated time of an episode (default: the environment's)."),
+    ] = None,
+) -> None:
+    """Measure a run's best policy, greedy, on unseen instances of every scale; write its weights and its card."""
+    from marl_sched.train.export import export_policy
+
+    if not name or Path(name).name != name or "." in name:
+        raise InvalidOptionError(f"NAME: expected a name without dots and slashes, got {name!r}")
+    options.check_folder(out)
+    path = out / f"{name}.safetensors"
+    card = export_policy(run_dir, path, instances=instances, episodes=episodes, seed=seed, length=length)
+    for scale, measured in card.scores.items():
+        typer.echo(f"{scale}: M1 {measured['M1']:.4f}")
+    typer.echo(path)

@@ -4,8 +4,12 @@ import json
 
 import pytest
 
+from marl_sched.agents.airme_rules import RULES
 from marl_sched.cli import demo
 from marl_sched.domain import get_domain
+from marl_sched.errors import DeploymentError
+from marl_sched.train.compare import play_episode
+from marl_sched.train.evaluate import Settings
 
 
 def test_the_demo_has_seven_crews():
@@ -15,6 +19,19 @@ def test_the_demo_has_seven_crews():
 def test_a_rule_plays_the_demo_with_the_local_view_as_it_comes():
     domain = get_domain(demo.ENV)
     assert demo._view_of(domain, "condition") == domain.views["local"]()
+
+
+@pytest.mark.parametrize("change", [lambda series: series[:-1], lambda series: [*series[:5], -1.0, *series[6:]]])
+def test_a_deployed_month_that_differs_from_the_one_in_one_process_is_an_error(change):
+    domain = get_domain(demo.ENV)
+    replay = play_episode(
+        domain, RULES["condition"](), domain.instances(demo.SCALE, 1, demo.SEED)[0], Settings(horizon=12, scale="small")
+    )
+    series = domain.telemetry.series(replay)[demo.OBJECTIVE]
+    demo._require_equal(series, domain, replay)
+    different = change(series)
+    with pytest.raises(DeploymentError, match=f"hour {11 if len(different) < 12 else 5}$"):
+        demo._require_equal(different, domain, replay)
 
 
 @pytest.mark.slow
