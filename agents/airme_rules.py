@@ -9,14 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache, partial
+from typing import cast
 
 import numpy as np
 
-from marl_sched.agents.airme_bound.index import IndexScheduler
+from marl_sched.agents.airme_bound.index import IndexScheduler, require_types
 from marl_sched.agents.base import ObservationScheduler, best_target
-from marl_sched.envs.airme.aircraft import PUBLISHED_TYPES, AircraftType, failure_table
+from marl_sched.envs.airme.aircraft import PUBLISHED_TYPES, AircraftType, FailureModel, failure_table
 from marl_sched.envs.airme.graph import graph_spec
+from marl_sched.envs.airme.simulator import AirmeSimulator
 from marl_sched.errors import InvalidOptionError
+from marl_sched.simulation import TurnSimulator
 
 Observation = Mapping[str, np.ndarray]
 _FIRST = 1e9  # added to scores of planes that go before all others
@@ -108,25 +111,45 @@ def condition(threshold: float = _HOURS_THRESHOLD) -> PriorityRule:
     return PriorityRule("condition", priority)
 
 
-def model_based(threshold: float = _FAILURE_THRESHOLD, types: Sequence[AircraftType] = PUBLISHED_TYPES) -> PriorityRule:
-    """Broken planes by income, then unbroken ones by their true failure probability of an hour flown now."""
+class ModelBasedRule(PriorityRule):
+    """Broken planes by income, then unbroken ones by their true failure probability of an hour flown now.
 
-    def priority(fleet: _Fleet) -> np.ndarray:
-        kind = (fleet.types @ np.arange(len(types))).astype(np.int64)
+    Args:
+        threshold: the least failure probability that is served.
+        types, failure: the failure model until it is started on a simulator, whose own takes its place.
+
+    An observation of another number of types raises InvalidOptionError.
+    """
+
+    def __init__(
+        self,
+        threshold: float = _FAILURE_THRESHOLD,
+        types: Sequence[AircraftType] = PUBLISHED_TYPES,
+        failure: FailureModel = "density",
+    ) -> None:
+        super().__init__("model-based", self._by_risk, needs="failure model")
+        self._threshold, self._types, self._failure = threshold, tuple(types), failure
+
+    def start(self, simulator: TurnSimulator, rows: np.ndarray) -> None:
+        """Know the simulator's types and failure model."""
+        of = cast(AirmeSimulator, simulator)
+        self._types, self._failure = of.types, of.failure
+
+    def _by_risk(self, fleet: _Fleet) -> np.ndarray:
+        require_types(self.name, fleet.types.shape[-1], self._types)
+        kind = (fleet.types @ np.arange(len(self._types))).astype(np.int64)
         hours, landings = fleet.hours.astype(np.int64), fleet.landings.astype(np.int64)
-        table = _failure_table(tuple(types), int(max(hours.max(), landings.max())).bit_length())
+        table = _failure_table(self._types, self._failure, int(max(hours.max(), landings.max())).bit_length())
         survival = np.ones_like(fleet.hours)
         for part in range(table.shape[1]):
             survival *= 1.0 - table[kind, part, landings if part == 0 else hours]
         risk = 1.0 - survival
-        return np.where(fleet.broken, _FIRST + fleet.income, np.where(risk >= threshold, risk, -np.inf))
-
-    return PriorityRule("model-based", priority, needs="failure model")
+        return np.where(fleet.broken, _FIRST + fleet.income, np.where(risk >= self._threshold, risk, -np.inf))
 
 
 @lru_cache(maxsize=16)
-def _failure_table(types: tuple[AircraftType, ...], bits: int) -> np.ndarray:
-    return failure_table(types, (1 << bits) - 1)
+def _failure_table(types: tuple[AircraftType, ...], failure: FailureModel, bits: int) -> np.ndarray:
+    return failure_table(types, (1 << bits) - 1, failure)
 
 
 def preventive_first(hours: float = _PREVENTIVE_HOURS, landings: float = _PREVENTIVE_LANDINGS) -> PriorityRule:
@@ -151,7 +174,7 @@ RULES: dict[str, Callable[[], ObservationScheduler]] = {
     "corrective-published": corrective_as_published,
     "condition": condition,
     "periodic": PeriodicRule,
-    "model-based": model_based,
+    "model-based": ModelBasedRule,
     "preventive-first": preventive_first,
     "index": IndexScheduler,
     "index-without-clock": partial(IndexScheduler, clock=False),

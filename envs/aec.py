@@ -5,18 +5,15 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
 from pettingzoo import AECEnv
 
-from marl_sched.domain import Domain
-from marl_sched.envs.single import SingleEpisode
-from marl_sched.envs.spaces import action_space, graph_space, observation_space
-from marl_sched.errors import IllegalActionError, InvalidOptionError, UnknownNameError
+from marl_sched.envs.face import SchedulingFace
+from marl_sched.errors import IllegalActionError, UnknownNameError
 from marl_sched.graph import ACTION_MASK, VISIBLE_SHARE
 from marl_sched.simulation import Observation
 
 
-class SchedulingAEC(AECEnv):
+class SchedulingAEC(SchedulingFace, AECEnv):
     """A domain as a PettingZoo AEC environment.
 
     Only agents with a decision to make are ever selected, `agents` stays the same until all end together, and
@@ -35,26 +32,6 @@ class SchedulingAEC(AECEnv):
 
     Raises InvalidOptionError for a `scheme`: every free agent has its turn here.
     """
-
-    def __init__(self, domain: str | Domain, **options: Any) -> None:
-        super().__init__()
-        refuse_scheme(options)
-        self._single = SingleEpisode(domain, **options)
-        self.metadata, self.render_mode = self._single.metadata, self._single.render_mode
-        simulator = self.simulator = self._single.simulator
-        self.possible_agents = [self._single.domain.agent_name(i) for i in range(simulator.max_agents)]
-        self._observation_spaces = {agent: observation_space(simulator) for agent in self.possible_agents}
-        self._action_spaces = {agent: action_space(simulator) for agent in self.possible_agents}
-        self.state_space = graph_space(simulator.arrays)
-        self.agents: list[str] = []
-
-    def observation_space(self, agent: str) -> spaces.Space:
-        """`Dict(observation=Dict(...), action_mask=Box)`, padded to the scale's largest instance."""
-        return self._observation_spaces[agent]
-
-    def action_space(self, agent: str) -> spaces.Space:
-        """`Discrete(max_targets)`, padded to the scale's largest instance."""
-        return self._action_spaces[agent]
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
         """Start episode 0 of `seed`, or the next episode; `options={"instance": ...}` gives its instance."""
@@ -96,10 +73,6 @@ class SchedulingAEC(AECEnv):
         if self._index[agent] == self._acting:
             return self._seen
         return self._look(self._index[agent])[0]
-
-    def state(self) -> dict[str, np.ndarray]:
-        """The full graph, arrays as `state_space` says; after the end no agent acts in it."""
-        return self._single.state()
 
     def step(self, action: Any) -> None:
         """Take the selected agent's turn.
@@ -143,18 +116,3 @@ class SchedulingAEC(AECEnv):
         for i, agent in enumerate(self.agents):
             self.infos[agent] = self._look(i)[1]
         self.agent_selection = self.agents[0]
-
-    def render(self) -> Any:
-        """The picture of the chosen render mode: str for `ansi`, uint8 (H, W, 3) for `rgb_array`."""
-        return self._single.render()
-
-    def close(self) -> None:
-        """Nothing is held open."""
-
-
-def refuse_scheme(options: dict[str, Any]) -> None:
-    """Raise InvalidOptionError if a decision scheme is asked for where every free agent has its turn."""
-    if "scheme" in options:
-        raise InvalidOptionError(
-            "scheme: in the AEC and Parallel faces every free agent decides; schemes are for Gymnasium and TorchRL"
-        )

@@ -7,7 +7,9 @@ else is a defect and keeps its traceback.
 from __future__ import annotations
 
 import difflib
+import operator
 from collections.abc import Iterable
+from typing import Any
 
 
 class MarlSchedError(Exception):
@@ -59,6 +61,15 @@ def require(what: str, name: str, known: Iterable[str]) -> str:
     return name
 
 
+def require_integer(what: str, value: Any, low: int, high: int, unit: str = "") -> int:
+    """`value` as int if it is an integer of [low, high], NumPy's included, else InvalidOptionError."""
+    if not isinstance(value, bool) and hasattr(value, "__index__") and low <= (number := operator.index(value)) <= high:
+        return number
+    of_unit = f" ({unit})" if unit else ""
+    raise InvalidOptionError(f"{what}: expected an integer in [{low}, {high}]{of_unit}, got {_shorten(value)}")
+
+
 def _shorten(value: object, limit: int = 60) -> str:
-    text = repr(value)
+    # Python refuses to write integers of thousands of digits in decimal.
+    text = hex(value) if isinstance(value, int) and value.bit_length() > 4 * limit else repr(value)
     return text if len(text) <= limit else text[: limit - 3] + "..."

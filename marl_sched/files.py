@@ -38,10 +38,17 @@ def write_json(path: str | Path, data: Any) -> None:
 
 
 def read_json(path: str | Path) -> Any:
-    """The JSON value in a file; InvalidFileError says where it is malformed or why it cannot be read."""
+    """The JSON value in a file; InvalidFileError says where it is malformed or why it cannot be read.
+
+    NaN and Infinity, which are not JSON, are refused.
+    """
     path = Path(path)
+
+    def refuse(constant: str) -> None:
+        raise ValueError(f"{constant} is none of its numbers")
+
     try:
-        return json.loads(path.read_bytes())
+        return json.loads(path.read_bytes(), parse_constant=refuse)
     except OSError as error:
         raise InvalidFileError(path, "", f"a readable file ({error.strerror})") from error
     except UnicodeDecodeError as error:
@@ -49,3 +56,7 @@ def read_json(path: str | Path) -> Any:
     except json.JSONDecodeError as error:
         where = f"line {error.lineno} column {error.colno}"
         raise InvalidFileError(path, where, f"valid JSON ({error.msg})") from error
+    except RecursionError as error:
+        raise InvalidFileError(path, "", "JSON that is not nested so deeply") from error
+    except ValueError as error:  # a constant, or an integer of thousands of digits, which Python does not read
+        raise InvalidFileError(path, "", f"valid JSON ({error})") from error

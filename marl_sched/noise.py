@@ -19,9 +19,12 @@ comes back as a plain int: pass it on as `np.uint64(key)`, since Numba takes pla
 from __future__ import annotations
 
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 from numba import njit
+
+from marl_sched.errors import require_integer
 
 FIRST_DOMAIN_STREAM = 16
 
@@ -38,6 +41,11 @@ class Stream(IntEnum):
 
     POLICY = 0  # a policy's own sampling, entity = agent
     CONFLICT = 1  # who of several agents has a target in the Parallel face, entity = target, draw = agent
+
+
+def as_seed(seed: Any) -> int:
+    """A seed as int in [0, 2**63), which is what an int64 can hold; InvalidOptionError otherwise."""
+    return require_integer("seed", seed, 0, 2**63 - 1)
 
 
 @njit(cache=True, inline="always")

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from marl_sched.errors import IllegalActionError
 from marl_sched.graph import ACTION_MASK, ArraySpec, GraphSpec
 from marl_sched.noise import Stream, uniforms
 
@@ -93,6 +94,15 @@ class TurnSimulator(ABC):
     @abstractmethod
     def free_agents(self, row: int) -> np.ndarray:
         """The agents, int64, that have still to act at this moment in `row`, in turn order."""
+
+    def give_turn(self, row: int, agent: int) -> None:
+        """Let an agent that has still to act at this moment act next; the others follow in turn order.
+
+        Raises IllegalActionError for an agent that has no turn left.
+        """
+        if agent not in self.free_agents(row):
+            raise IllegalActionError(f"row {row}: agent {agent} has no turn at time {self.time[row]}")
+        self.acting[row] = agent
 
     @abstractmethod
     def objectives(self) -> dict[str, np.ndarray]:

@@ -31,6 +31,7 @@ from marl_sched.agents.base import ObservationScheduler, best_target
 from marl_sched.envs.airme.aircraft import PUBLISHED_TYPES, AircraftType, FailureModel
 from marl_sched.envs.airme.graph import graph_spec
 from marl_sched.envs.airme.simulator import DEFAULT_HORIZON, AirmeSimulator
+from marl_sched.errors import InvalidOptionError
 from marl_sched.simulation import TurnSimulator
 
 INCOMES = 5  # nodes between which indices are interpolated
@@ -51,7 +52,8 @@ class IndexScheduler(ObservationScheduler):
         objective, horizon, types, failure: what it plans for until it is started on a simulator, whose own
             take their place.
 
-    Tables are computed at the first choice; that takes seconds and some 100 MB.
+    Tables are computed at the first choice; that takes seconds and some 100 MB. An observation of another number
+    of types than it plans for raises InvalidOptionError.
     """
 
     def __init__(
@@ -78,10 +80,20 @@ class IndexScheduler(ObservationScheduler):
 
     def choose(self, observation: Mapping[str, np.ndarray], uniform: np.ndarray) -> np.ndarray:
         """Targets int64 (B,); `uniform` is not used."""
+        require_types(self.name, observation["plane"].shape[-1] - len(_FEATURES), self._problem[2])
         if self._tables is None:
             self._tables = _Tables(*self._problem, clock=self._clock)
         scores = self._tables.indices(observation)
         return best_target(scores, (np.asarray(observation["action_mask"]) > 0) & (scores > 0.0))
+
+
+def require_types(scheduler: str, seen: int, types: Sequence[AircraftType]) -> None:
+    """Raise InvalidOptionError if an observation tells apart another number of types than a scheduler knows."""
+    if seen != len(types):
+        raise InvalidOptionError(
+            f"{scheduler}: its failure model knows {len(types)} aircraft types "
+            f"({', '.join(kind.name for kind in types)}), the observation has {seen}"
+        )
 
 
 class _Tables:

@@ -241,9 +241,9 @@ def _status(plane: Record) -> int:
 
 
 @njit(cache=True, inline="always")
-def next_free(crews: np.ndarray, n_crews: int, first: int) -> int:
-    """The lowest crew from `first` on that is free and undecided, -1 if there is none."""
-    for crew in range(first, n_crews):
+def next_free(crews: np.ndarray, n_crews: int) -> int:
+    """The lowest crew that is free and undecided, -1 if there is none."""
+    for crew in range(n_crews):
         if crews[crew].plane == 0 and crews[crew].choice == UNDECIDED:
             return crew
     return -1
@@ -322,13 +322,13 @@ def step(state: State, rules: Rules, targets: np.ndarray) -> None:
             continue
         decide(state, b, row.acting, targets[b])
         ends = rules.scheme == SINGLE or (rules.scheme == SKIP and targets[b] == IDLE)
-        following = -1 if ends else next_free(state.crews[b], row.n_crews, row.acting + 1)
+        following = -1 if ends else next_free(state.crews[b], row.n_crews)
         while following < 0 and not row.terminated and not row.truncated:
             if state.told_at.shape[0] > 0:
                 pass_hour_with_memory(state, rules, b)
             else:
                 pass_hour(state, rules, b)
-            following = next_free(state.crews[b], row.n_crews, 0)
+            following = next_free(state.crews[b], row.n_crews)
         row.acting = -1 if row.terminated or row.truncated else following
 
 
@@ -364,4 +364,4 @@ def play_hour(state: State, rules: Rules, choices: np.ndarray) -> None:
         else:
             pass_hour(state, rules, b)
         over = row.terminated or row.truncated
-        row.acting = -1 if over else next_free(state.crews[b], row.n_crews, 0)
+        row.acting = -1 if over else next_free(state.crews[b], row.n_crews)

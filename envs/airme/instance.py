@@ -17,6 +17,7 @@ from marl_sched.errors import InvalidFileError, InvalidOptionError, UnknownNameE
 from marl_sched.files import read_json, write_json
 
 SCHEMA = 1
+MOST_INCOME = 1e9  # sums over a fleet stay finite
 MOST = 1_000_000  # counters index failure tables and crews size arrays: beyond this a file is wrong, not large
 
 
@@ -53,7 +54,7 @@ class AirmeInstance:
                 return f"{name}: expected one value per plane ({self.n_planes}), got {getattr(self, name).shape}"
         for name, good, expected in (
             ("kind", (self.kind >= 0) & (self.kind < len(self.types)), f"an index into {len(self.types)} types"),
-            ("income", np.isfinite(self.income) & (self.income > 0), "a number > 0 (per flying hour)"),
+            ("income", (self.income > 0) & (self.income <= MOST_INCOME), _INCOME),
             ("hours", (self.hours >= 0) & (self.hours <= MOST), f"an integer in [0, {MOST}]"),
             ("landings", (self.landings >= 0) & (self.landings <= MOST), f"an integer in [0, {MOST}]"),
         ):
@@ -92,6 +93,7 @@ class AirmeInstance:
         write_json(path, {"schema": SCHEMA, "env": "airme", "n_crews": self.n_crews, "types": types, "planes": planes})
 
 
+_INCOME = f"a number in (0, {MOST_INCOME:.0e}] (per flying hour)"
 _ARRAYS: dict[str, type] = {
     "kind": np.int32,
     "income": np.float64,
@@ -167,7 +169,7 @@ def load(path: str | Path) -> AirmeInstance:
         where = f"planes[{p}]"
         name = reader.take(row, where, "type", lambda v: isinstance(v, str) and v in names, f"one of {[*names]}")
         columns["kind"].append(names[name])
-        columns["income"].append(reader.take(row, where, "income", _is_positive, "a number > 0 (per flying hour)"))
+        columns["income"].append(reader.take(row, where, "income", _is_income, _INCOME))
         columns["hours"].append(reader.take(row, where, "hours", _is_natural, f"an integer in [0, {MOST}]"))
         columns["landings"].append(reader.take(row, where, "landings", _is_natural, f"an integer in [0, {MOST}]"))
         columns["broken"].append(reader.take(row, where, "broken", lambda v: isinstance(v, bool), "true or false"))
@@ -208,7 +210,7 @@ def _read_type(reader: _Reader, where: str, row: Any) -> AircraftType:
 
     name = reader.take(row, where, "name", lambda v: isinstance(v, str) and v != "", "a name")
     scales = numbers("scales", "numbers > 0, one for each part", lambda v: len(v) > 0 and min(v) > 0)
-    low, high = numbers("income", "bounds 0 < low <= high", lambda v: len(v) == 2 and 0 < v[0] <= v[1])
+    low, high = numbers("income", f"bounds 0 < low <= high <= {MOST_INCOME:.0e}", _are_incomes)
     return AircraftType(
         name=name,
         scales=scales,
@@ -226,6 +228,14 @@ def _is_number(value: Any) -> bool:
 
 def _is_positive(value: Any) -> bool:
     return _is_number(value) and value > 0
+
+
+def _is_income(value: Any) -> bool:
+    return _is_positive(value) and value <= MOST_INCOME
+
+
+def _are_incomes(values: list[float]) -> bool:
+    return len(values) == 2 and 0 < values[0] <= values[1] <= MOST_INCOME
 
 
 def _is_natural(value: Any) -> bool:

@@ -10,11 +10,12 @@ from marl_sched.envs.airme import dynamics, graph
 from marl_sched.envs.airme.aircraft import FailureModel, failure_table
 from marl_sched.envs.airme.instance import SCALES, AirmeInstance
 from marl_sched.envs.airme.views import FullView, LocalView
-from marl_sched.errors import IllegalActionError, InvalidOptionError, require
-from marl_sched.noise import episode_key
+from marl_sched.errors import IllegalActionError, InvalidOptionError, require, require_integer
+from marl_sched.noise import as_seed, episode_key
 from marl_sched.simulation import Observation, TurnSimulator
 
 DEFAULT_HORIZON = 720
+MOST_HOURS = 1_000_000  # of an episode: books are kept for every hour
 
 
 class AirmeSimulator(TurnSimulator):
@@ -72,7 +73,7 @@ class AirmeSimulator(TurnSimulator):
             stop_share=stop_share or 0.0,
         )
         self._expose()
-        self._seeds = np.full(self.batch, seed, np.int64)
+        self._seeds = np.zeros(self.batch, np.int64)
         self._episodes = np.full(self.batch, -1, np.int64)
         self.reset(seed=seed)
 
@@ -91,8 +92,7 @@ class AirmeSimulator(TurnSimulator):
         require("scheme", scheme, dynamics.SCHEMES)
         if pad is not None:
             require("scale of airme", pad, SCALES)
-        if horizon < 1:
-            raise InvalidOptionError(f"horizon: expected at least 1 hour, got {horizon}")
+        require_integer("horizon", horizon, 1, MOST_HOURS, "hours")
         if stop_share is not None and not 0 < stop_share <= 1:
             raise InvalidOptionError(f"stop_share: expected a share in (0, 1] or None, got {stop_share}")
 
@@ -121,7 +121,7 @@ class AirmeSimulator(TurnSimulator):
                 self.instances[b] = instance
         self._cover_counters([self.instances[b] for b in chosen])
         if seed is not None:
-            self._seeds[chosen] = seed
+            self._seeds[chosen] = as_seed(seed)
             self._episodes[chosen] = 0
         else:
             self._episodes[chosen] += 1

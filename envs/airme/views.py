@@ -9,9 +9,10 @@ from dataclasses import dataclass
 
 from numba import njit
 
-from marl_sched.errors import InvalidOptionError
+from marl_sched.errors import require_integer
 
 EVERYWHERE = 1 << 30
+MOST_STALENESS = 8760  # hours: a year, of which a simulator keeps a picture an hour
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +34,7 @@ class LocalView:
     Its own sector it sees as it is; another one as it was `staleness` hours ago. Of a crew within `comm` it
     knows the present job and, if that crew has already acted this hour, its choice. What a conflict told it
     of a plane, and how it left a plane that it repaired itself, it keeps until the sector's picture is newer.
-    Raises InvalidOptionError for a negative option.
+    Raises InvalidOptionError for an option that is not an integer, negative or too large.
     """
 
     kind = "local"
@@ -43,10 +44,9 @@ class LocalView:
     staleness: int = 0  # hours
 
     def __post_init__(self) -> None:
-        """Refuse negative options."""
-        for name in ("reach", "comm", "staleness"):
-            if getattr(self, name) < 0:
-                raise InvalidOptionError(f"view local: {name}: expected an integer >= 0, got {getattr(self, name)}")
+        """Bring the options to plain integers and refuse those outside their range."""
+        for name, most in (("reach", EVERYWHERE), ("comm", EVERYWHERE), ("staleness", MOST_STALENESS)):
+            object.__setattr__(self, name, require_integer(f"view local: {name}", getattr(self, name), 0, most))
 
     @property
     def limits(self) -> tuple[int, int, int]:

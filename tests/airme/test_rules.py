@@ -10,16 +10,16 @@ from scipy.stats import chisquare, weibull_min
 
 from marl_sched.agents.airme_rules import (
     RULES,
+    ModelBasedRule,
     PeriodicRule,
     RandomRule,
     condition,
     corrective,
     corrective_as_published,
-    model_based,
     preventive_first,
 )
 from marl_sched.agents.base import ObservationScheduler
-from marl_sched.envs.airme.aircraft import PUBLISHED_TYPES
+from marl_sched.envs.airme.aircraft import PUBLISHED_TYPES, AircraftType, FailureModel
 from marl_sched.envs.airme.instance import AirmeInstance, generate
 from marl_sched.envs.airme.simulator import AirmeSimulator
 from marl_sched.errors import InvalidOptionError
@@ -37,9 +37,10 @@ def fleet_of(*planes: tuple[int, float, int, int, bool], n_crews: int = 1) -> Ai
     )  # fmt: skip
 
 
-def order(rule: ObservationScheduler, instance: AirmeInstance) -> list[int]:
+def order(rule: ObservationScheduler, instance: AirmeInstance, failure: FailureModel = "density") -> list[int]:
     """The slots that crews in turn are sent to in hour 0, up to the first that stays."""
-    simulator = AirmeSimulator([instance])
+    simulator = AirmeSimulator([instance], failure=failure)
+    rule.start(simulator, np.ones(1, bool))
     slots: list[int] = []
     while simulator.time[0] == 0:
         target = int(rule.decide(simulator)[0])
@@ -102,8 +103,48 @@ def test_model_based_serves_worn_planes_by_their_true_failure_probability_from_0
         (FIXED, 9.0, 20, 4, False), (FIXED, 1.0, 20, 5, False), (HELI, 9.0, 20, 3, False), (HELI, 1.0, 20, 4, False),
         (HELI, 1.0, 0, 0, True), n_crews=5,
     )  # fmt: skip
-    assert order(model_based(), instance) == [5, 4, 2]
-    assert model_based().needs == "failure model"
+    assert order(ModelBasedRule(), instance) == [5, 4, 2]
+    assert ModelBasedRule().needs == "failure model"
+
+
+def test_model_based_knows_the_hazard_where_parts_fail_by_it() -> None:
+    # Fixed-wing at 30 landings: the density is 1/3 x 16 x exp(-32) = 7e-14, the hazard 1/3 x 16, capped at 1.
+    instance = fleet_of((FIXED, 9.0, 0, 30, False), (FIXED, 9.0, 20, 5, False), n_crews=3)
+    assert order(ModelBasedRule(), instance) == [2]
+    assert order(ModelBasedRule(), instance, failure="hazard") == [1, 2]
+
+
+def drones(n_types: int) -> AirmeInstance:
+    """A plane of each of `n_types` types, the first of which fails soonest: 3/9 (l/9)^2 exp(-(l/9)^3), l = 6."""
+    types = tuple(
+        AircraftType(name=f"drone {k}", scales=(9.0 + 9 * k,), shapes=(3.0,), hour_norm=1, usage=0.5, income=(1, 2))
+        for k in range(n_types)
+    )
+    kind, same = np.arange(n_types)[::-1], np.ones(n_types)
+    return AirmeInstance(
+        n_crews=n_types + 1, kind=kind, income=same, hours=same * 6, landings=same * 6, broken=same < 0, types=types
+    )
+
+
+@pytest.mark.parametrize("n_types", [1, 3])
+def test_model_based_and_the_index_plan_for_the_fleets_own_types(n_types: int) -> None:
+    # Landing densities at 6: 0.110 of scale 9, 0.0178 of scale 18, 0.0054 of scale 27.
+    assert order(ModelBasedRule(), drones(n_types)) == [*range(n_types, 0, -1)]
+    simulator = AirmeSimulator([drones(n_types)], horizon=4)
+    scheduler = RULES["index"]()
+    scheduler.start(simulator, np.ones(1, bool))
+    assert 0 <= scheduler.decide(simulator)[0] <= n_types
+
+
+@pytest.mark.parametrize("name", ["model-based", "index", "index-without-clock"])
+@pytest.mark.parametrize("n_types", [1, 3])
+def test_rules_that_know_the_failure_model_refuse_types_they_were_not_made_for(name: str, n_types: int) -> None:
+    simulator = AirmeSimulator([drones(n_types)])
+    message = (
+        f"{name}: its failure model knows 2 aircraft types .fixed_wing, helicopter., the observation has {n_types}"
+    )
+    with pytest.raises(InvalidOptionError, match=message):
+        RULES[name]().decide(simulator)
 
 
 def test_preventive_first_serves_worn_planes_before_broken_ones() -> None:

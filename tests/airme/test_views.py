@@ -335,9 +335,19 @@ def test_observation_is_finite_and_within_the_declared_bounds() -> None:
 
 
 @pytest.mark.parametrize("option", ["reach", "comm", "staleness"])
-def test_negative_view_option_raises(option: str) -> None:
-    with pytest.raises(InvalidOptionError, match=rf"view local: {option}: expected an integer >= 0, got -1"):
-        LocalView(**{option: -1})
+@pytest.mark.parametrize("value", [-1, 1.5, "x", True, None, 10**30, pytest.param(10**5000, id="huge")])
+def test_view_option_that_is_no_integer_of_its_range_raises(option: str, value: object) -> None:
+    with pytest.raises(InvalidOptionError, match=rf"view local: {option}: expected an integer in \[0, \d+\], got "):
+        LocalView(**{option: value})  # type: ignore[arg-type]
+
+
+def test_staleness_of_more_than_a_year_raises() -> None:
+    with pytest.raises(InvalidOptionError, match=r"staleness: expected an integer in \[0, 8760\], got 1000000000"):
+        LocalView(staleness=10**9)
+
+
+def test_view_options_of_numpy_become_plain_integers() -> None:
+    assert [type(value) for value in LocalView(reach=np.int64(2), comm=np.uint8(1)).limits] == [int, int, int]  # type: ignore[arg-type]
 
 
 def test_full_view_has_no_options() -> None:

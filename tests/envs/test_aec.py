@@ -275,6 +275,14 @@ def test_observations_already_handed_out_do_not_change(domain, pick):
         np.testing.assert_array_equal(array, copies[name])
 
 
+@pytest.mark.parametrize("make_env", [airme_v0.raw_env, airme_v0.parallel_env])
+def test_spaces_of_agents_that_cannot_be_are_refused_by_name(make_env):
+    env = make_env()
+    for space in (env.action_space, env.observation_space):
+        with pytest.raises(UnknownNameError, match="unknown agent 'crew_99'"):
+            space("crew_99")
+
+
 @pytest.mark.parametrize("make_env", [airme_v0.env, airme_v0.raw_env, airme_v0.parallel_env])
 def test_unknown_options_raise(make_env):
     with pytest.raises(TypeError, match="heigth"):

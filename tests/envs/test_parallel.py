@@ -101,6 +101,101 @@ def test_of_all_who_choose_one_target_the_smallest_draw_has_it():
     assert won == {0, 1, 3}
 
 
+def mix_by_hand(x):
+    """The finaliser of SplitMix64 on Python integers, from the paper's constants, of `x` modulo 2**64."""
+    word = (1 << 64) - 1
+    x &= word
+    x = ((x ^ (x >> 30)) * 0xBF58476D1CE4E5B9) & word
+    x = ((x ^ (x >> 27)) * 0x94D049BB133111EB) & word
+    return x ^ (x >> 31)
+
+
+def test_the_draw_is_that_of_its_definition_for_keys_of_all_sizes():
+    def by_hand(key, time, target, agent):
+        moment = mix_by_hand((key ^ time) + 0x9E3779B97F4A7C15)
+        name = (int(Stream.CONFLICT) << 56) | (agent << 40) | target
+        return mix_by_hand(moment + (name + 1) * 0x9E3779B97F4A7C15) >> 11
+
+    env = make("airme", scale=None, instance=fleet(6, 4))
+    high = 0
+    for seed in (*range(100), *(2**63 - 1 - 3**k for k in range(39))):
+        env.reset(seed=seed)
+        key, time = int(env.simulator.episode_keys[0]), int(env.simulator.time[0])
+        high += key >= 2**63
+        env.step(dict.fromkeys(env.agents, 5))
+        assert env.simulator.state.planes["crew"][0, 5] == min(range(4), key=lambda a: by_hand(key, time, 5, a))
+    assert 40 < high < 100
+
+
+STALE = {"kind": "local", "reach": 2, "comm": 0, "staleness": 6}
+
+
+def test_losers_of_a_target_learn_what_they_would_in_aec(bits):
+    from marl_sched.envs.aec import SchedulingAEC
+
+    options = {"scale": None, "instance": fleet(6, 4), "view": STALE}
+    env, aec = make("airme", **options), SchedulingAEC("airme", horizon=HORIZON["airme"], **options)
+    won = set()
+    for seed in range(12):
+        env.reset(seed=seed)
+        best = winner(env, 3, [0, 1, 3])
+        observations, *_, infos = env.step({"crew_0": 3, "crew_1": 3, "crew_2": 0, "crew_3": 3})
+        losers = {0, 1, 3} - {best}
+        for loser in losers:
+            seen = observations[f"crew_{loser}"]
+            assert infos[f"crew_{loser}"]["conflict"]
+            assert seen["action_mask"][3] == 0  # somebody has it in hand
+            assert env.simulator.state.told_at[0, loser, 3] == 0
+            assert env.simulator.state.told["chosen"][0, loser, 3] == best
+        won.add(best)
+        if best == 0:  # AEC's turns come in the same order
+            aec.reset(seed=seed)
+            for target in (3, 3, 0, 3):
+                aec.step(target)
+            for _ in range(5):
+                assert env.simulator.time[0] == aec.simulator.time[0]
+                assert bits(env.simulator.snapshot(0)) == bits(aec.simulator.snapshot(0))
+                for loser in losers:
+                    mine, theirs = observations[f"crew_{loser}"], aec.simulator.observe(np.array([loser]))
+                    for name, array in mine["observation"].items():
+                        np.testing.assert_array_equal(array, theirs[name][0], err_msg=name)
+                free = env.simulator.free_agents(0)
+                observations, *_ = env.step(dict.fromkeys(env.agents, 0))
+                for _ in free:
+                    aec.step(0)
+    assert won == {0, 1, 3}
+
+
+def test_losers_in_murse_idle_a_unit_and_know_who_has_the_task():
+    env = make("murse", mode="online")
+    observations, _ = env.reset(seed=3)
+    free = env.simulator.free_agents(0).tolist()
+    assert len(free) > 1
+    legal = np.all([observations[env.agents[i]]["action_mask"] for i in free], axis=0)
+    target = int(np.flatnonzero(legal)[1])
+    best = winner(env, target, free)
+    infos = env.step(dict.fromkeys(env.agents, target))[-1]
+    state = env.simulator.state
+    assert state.tasks["agent"][0, target - 1] == best
+    assert {agent for agent, info in infos.items() if info["conflict"]} == {env.agents[i] for i in free if i != best}
+    assert state.rows["conflicts"][0] == len(free) - 1
+    assert env.simulator.time[0] == 1
+    assert all((state.told[0, i, target - 1] >= 0).all() for i in free if i != best)
+
+
+def test_an_agent_that_has_acted_is_given_no_second_turn(domain):
+    env = make(domain)
+    env.reset(seed=1)
+    simulator = env.simulator
+    first, last = simulator.free_agents(0)[[0, -1]]
+    simulator.give_turn(0, last)
+    assert simulator.acting[0] == last
+    simulator.step(np.array([0]))
+    assert simulator.acting[0] == first
+    with pytest.raises(IllegalActionError, match=f"row 0: agent {last} has no turn at time 0"):
+        simulator.give_turn(0, last)
+
+
 def test_idling_together_is_no_conflict():
     env = make("airme", scale=None, instance=fleet(6, 4))
     env.reset(seed=1)

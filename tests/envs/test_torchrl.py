@@ -60,6 +60,7 @@ def test_the_mask_transform_serves_policies_that_sample_from_the_spec(domain):
     td = env.reset()
     for _ in range(30):
         td["action"] = env.action_spec.rand()
+        assert td["action_mask"].gather(-1, td["action"].unsqueeze(-1)).all()
         td = step_mdp(env.step(td))
 
 

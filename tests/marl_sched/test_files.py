@@ -90,3 +90,21 @@ def test_bytes_that_are_no_text_are_located(tmp_path):
     path.write_bytes(b'{"name": "Fl\xfcgel"}')
     with pytest.raises(InvalidFileError, match=r"latin\.json: byte 12: expected UTF-8 text"):
         read_json(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("[" * 100_000 + "]" * 100_000, "expected JSON that is not nested so deeply"),
+        ('{"a":' * 100_000 + "1" + "}" * 100_000, "expected JSON that is not nested so deeply"),
+        ("9" * 5000, r"expected valid JSON \(Exceeds the limit \(4300 digits\)"),
+        ("[1, NaN]", r"expected valid JSON \(NaN is none of its numbers\)"),
+        ("[Infinity]", r"expected valid JSON \(Infinity is none"),
+        ("[-Infinity]", r"expected valid JSON \(-Infinity is none"),
+    ],
+)
+def test_what_python_reads_differently_from_json_or_not_at_all_is_refused(tmp_path, content, message):
+    path = tmp_path / "odd.json"
+    path.write_text(content)
+    with pytest.raises(InvalidFileError, match=rf"odd\.json: {message}"):
+        read_json(path)
