@@ -7,9 +7,11 @@ from collections.abc import Callable
 from marl_sched.agents.base import Scheduler
 from marl_sched.agents.murse.genetic import GeneticEdf
 from marl_sched.agents.murse.negotiated import Cbba, Tessi
-from marl_sched.agents.murse.optimal import ExactScheduler, RollingScheduler
+from marl_sched.agents.murse.optimal import ExactScheduler, RollingScheduler, is_feasible
 from marl_sched.agents.murse.rules import EdfPublished, FirstClaim, RandomRule, edf, hctf
 from marl_sched.agents.murse.tercio import Tercio
+
+IS_FEASIBLE = is_feasible
 
 RULES: dict[str, Callable[..., Scheduler]] = {
     "random": RandomRule,

@@ -32,9 +32,12 @@ class WorldOptions:
         run: the run's name, part of every key.
         listen: endpoint, port 0 takes a free one.
         deadline: seconds that a decision may take; a late one idles the agent for this moment.
-        patience: this many missed deadlines in a row make an agent count as dead: it is not asked any more. So
-            an agent that falls silent delays the others by at most patience x deadline seconds, one whose process
-            ends or freezes by at most a second, as its liveliness token goes.
+        patience: this many missed deadlines in a row make an agent count as dead: it is not asked any more. It
+            may come back as another incarnation, which is given up at its first miss unless it has decided in time,
+            until 2 x patience turns in a row were waited for in vain: then nobody may decide for it in this run. So
+            between two decisions in time an agent delays the others by at most 2 x patience x deadline seconds; one
+            that stays silent by patience x deadline, one whose process ends or freezes by at most a second, as its
+            liveliness token goes.
         ready_timeout: seconds to wait for all agents at the start.
         report: file for the JSON report; "" writes none.
     """
@@ -77,11 +80,7 @@ class WorldOptions:
     def simulator(self) -> TurnSimulator:
         """The plant's simulator, one row at the start of its episode; typed errors for options that do not fit."""
         domain = self.domain()
-        view_type: Any = domain.views[require(f"view of {self.env}", self.view, domain.views)]
-        try:
-            view = view_type(**self.view_options)
-        except TypeError as error:
-            raise InvalidOptionError(f"view {self.view}: {error}") from error
+        view = domain.view(self.view, **self.view_options)
         domain.require_scale(self.scale)
         if self.instance:
             instance = domain.load(Path(self.instance))

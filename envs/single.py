@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from marl_sched.domain import Domain
-from marl_sched.envs.options import as_domain, as_instance, as_seed, as_view
+from marl_sched.envs.options import as_domain, as_instance, as_seed
 from marl_sched.errors import IllegalActionError, InvalidOptionError, require
 from marl_sched.graph import ACTION_MASK
 from marl_sched.simulation import Observation
@@ -68,7 +68,7 @@ class SingleEpisode:
         self._seed, self._episode = as_seed(seed), -1
         self.simulator = self.domain.simulator(
             [self._instance(0)],
-            view=as_view(self.domain, view),
+            view=self.domain.make_view(view),
             objective=self.domain.objectives[0] if objective is None else objective,
             horizon=self.domain.default_horizon if horizon is None else horizon,
             seed=self._seed,

@@ -30,7 +30,7 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, TensorSpec, Un
 from torchrl.envs import EnvBase
 
 from marl_sched.domain import Domain
-from marl_sched.envs.options import as_domain, as_instance, as_seed, as_view
+from marl_sched.envs.options import as_domain, as_instance, as_seed
 from marl_sched.envs.sampling import first_illegal, random_legal
 from marl_sched.errors import IllegalActionError, InvalidOptionError
 from marl_sched.graph import ACTION_MASK, ArraySpec
@@ -88,7 +88,7 @@ class SchedulingTorchRL(EnvBase):
         self._set_seed(seed)
         self.simulator = self.domain.simulator(
             self._instances(range(rows), 0),
-            view=as_view(self.domain, view),
+            view=self.domain.make_view(view),
             objective=self.domain.objectives[0] if objective is None else objective,
             horizon=self.domain.default_horizon if horizon is None else horizon,
             seed=self._seed,

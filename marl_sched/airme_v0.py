@@ -105,6 +105,7 @@ from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
 from marl_sched.envs.aec import SchedulingAEC
 from marl_sched.envs.airme.instance import AirmeInstance
+from marl_sched.envs.options import all_options
 from marl_sched.envs.parallel import SchedulingParallel
 
 __all__ = ["env", "parallel_env", "raw_env"]
@@ -131,17 +132,6 @@ def env(**options: Any) -> OrderEnforcingWrapper:
     return OrderEnforcingWrapper(raw_env(**options))
 
 
-def parallel_env(
-    *,
-    scale: str | None = "small",
-    instance: AirmeInstance | str | Path | None = None,
-    view: Any = "full",
-    objective: str = "profit",
-    horizon: int = 720,
-    seed: int = 0,
-    failure: str = "density",
-    stop_share: float | None = None,
-    render_mode: str | None = None,
-) -> SchedulingParallel:
-    """The Parallel environment; the module's page explains the options."""
-    return SchedulingParallel("airme", **locals())
+def parallel_env(**options: Any) -> SchedulingParallel:
+    """The Parallel environment; options as `raw_env`."""
+    return SchedulingParallel("airme", **all_options(raw_env, options))

@@ -6,14 +6,16 @@ A third domain costs one folder that builds a `Domain` and calls `register`, and
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from numbers import Real
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol, get_type_hints
 
 import numpy as np
 
-from marl_sched.errors import require
+from marl_sched.errors import InvalidOptionError, require
 
 if TYPE_CHECKING:
     from gymnasium.spaces import Space
@@ -93,7 +95,7 @@ class Domain:
         title: one line for `marl-sched list`.
         scales: the instance generator's settings by name, smallest first.
         objectives: names of the rewards to choose from, the default first.
-        views: view name -> dataclass of the view's options.
+        views: view name -> dataclass of the view's options, which are ints and floats.
         agent_prefix: agents are called `<prefix>_<i>`.
         generate: (scale, rng) -> instance.
         load: path -> instance; raises InvalidFileError.
@@ -105,7 +107,17 @@ class Domain:
         render: mode -> function of a simulator row, `ansi` gives str, `rgb_array` gives uint8 (H, W, 3).
         render_options: render mode -> options that a simulator must be made with to be drawn so.
         default_horizon: simulated time of an episode.
+        unit: what the simulated time of an episode counts, in the plural, as results and tables name it.
+        better: whether a scheduler with a higher or a lower M1 is the better one.
         telemetry: how the state travels to deployed agents; None: the domain cannot be deployed.
+        reference: name of the scheduler over which M2 is the gain; None: results have no M2.
+        cli_options: options of the command line that the domain has, without dashes -> the simulator's argument.
+        generate_accepted: (scale, rng, accept) -> an instance that `accept` takes, redrawn until it does; None:
+            every generated instance can be solved.
+        impossibilities: instance -> why no schedule of it can be feasible, a sentence each; empty if none is known.
+        legend: what the colours of the `rgb_array` picture mean, meaning -> RGB in 0 .. 255; None: it needs none.
+        band: what a band of the `rgb_array` picture is and how many pixels high, such as ("plane", 4); None: the
+            picture brings axes of its own.
     """
 
     name: str
@@ -123,7 +135,14 @@ class Domain:
     default_horizon: int
     telemetry: Telemetry | None = None
     render_options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    extras: Mapping[str, Any] = field(default_factory=dict)
+    unit: str = "hours"
+    better: Literal["higher", "lower"] = "higher"
+    reference: str | None = None
+    cli_options: Mapping[str, str] = field(default_factory=dict)
+    generate_accepted: Callable[[str, np.random.Generator, Callable[[Any], bool]], Any] | None = None
+    impossibilities: Callable[[Any], list[str]] = lambda instance: []
+    legend: Mapping[str, Sequence[int]] | None = None
+    band: tuple[str, int] | None = None
 
     def agent_name(self, agent: int) -> str:
         """`crew_3` for agent 3 of a domain whose agents are crews."""
@@ -141,6 +160,43 @@ class Domain:
     def require_objective(self, objective: str) -> str:
         """The objective's name, or UnknownNameError."""
         return require(f"objective of {self.name}", objective, self.objectives)
+
+    def view(self, kind: str, /, **options: Any) -> Any:
+        """The view of that kind with those options; raises as `make_view`."""
+        return self.make_view({"kind": kind, **options})
+
+    def make_view(self, given: Any) -> Any:
+        """A view from None (full), its kind, `{"kind": kind, **options}`, or itself.
+
+        Raises UnknownNameError for a kind that the domain does not have. Raises InvalidOptionError for an option
+        that the kind does not have, a value of another type, a number that is not finite or outside the option's
+        bounds, and for anything else that does not describe a view.
+        """
+        if isinstance(given, tuple(self.views.values())):
+            return given
+        words = {"kind": "full"} if given is None else {"kind": given} if isinstance(given, str) else given
+        if not isinstance(words, Mapping) or "kind" not in words:
+            raise InvalidOptionError(f"view: expected one of {', '.join(self.views)} or a view object, got {given!r}")
+        kind = require(f"view of {self.name}", words["kind"], self.views)
+        view_type = self.views[kind]
+        types = get_type_hints(view_type)
+        known = [option.name for option in fields(view_type)]
+        options = {name: value for name, value in words.items() if name != "kind"}
+        for name, value in options.items():
+            if name not in known:
+                has = ", ".join(known) or "none"
+                raise InvalidOptionError(f"view {kind}: {name}: expected an option of this view of {self.name}: {has}")
+            options[name] = _as_number(f"view {kind}: {name}", value, types[name])
+        return view_type(**options)
+
+
+def _as_number(where: str, value: Any, kind: type) -> Any:
+    """A finite int or float as a view's field has it; a whole number counts as an int however it is written."""
+    finite = not isinstance(value, bool) and isinstance(value, Real) and math.isfinite(value)
+    if not finite or kind(value) != value:
+        expected = "an integer" if kind is int else "a finite number"
+        raise InvalidOptionError(f"{where}: expected {expected}, got {value!r}")
+    return kind(value)
 
 
 _DOMAINS: dict[str, Domain] = {}

@@ -121,6 +121,7 @@ from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
 from marl_sched.envs.aec import SchedulingAEC
 from marl_sched.envs.murse.instance import MurseInstance
+from marl_sched.envs.options import all_options
 from marl_sched.envs.parallel import SchedulingParallel
 
 __all__ = ["env", "parallel_env", "raw_env"]
@@ -153,23 +154,6 @@ def env(**options: Any) -> OrderEnforcingWrapper:
     return OrderEnforcingWrapper(raw_env(**options))
 
 
-def parallel_env(
-    *,
-    scale: str | None = "small",
-    instance: MurseInstance | str | Path | None = None,
-    view: Any = "full",
-    objective: str = "makespan",
-    horizon: int = 10,
-    seed: int = 0,
-    mode: str = "plan",
-    picking: str = "first",
-    rewards: str = "round",
-    multiplier: float = 2.0,
-    divisor: float = 1.0,
-    simplification: str = "sparse",
-    durations: str | None = None,
-    proximity: str | None = None,
-    render_mode: str | None = None,
-) -> SchedulingParallel:
-    """The Parallel environment; the module's page explains the options."""
-    return SchedulingParallel("murse", **locals())
+def parallel_env(**options: Any) -> SchedulingParallel:
+    """The Parallel environment; options as `raw_env`."""
+    return SchedulingParallel("murse", **all_options(raw_env, options))

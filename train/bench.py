@@ -7,20 +7,17 @@ as little as it can. Nothing is compiled, drawn or decided within a measurement 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import torch
 
+from marl_sched.agents.benchmark import own_benchmarks
 from marl_sched.agents.hetgat.network import HetGATNetwork
 from marl_sched.agents.hetgat.policy import HetGATPolicy
-from marl_sched.agents.murse.list_schedule import edf_schedule
-from marl_sched.agents.murse.problem import Round
-from marl_sched.agents.registry import create_scheduler
 from marl_sched.domain import Domain
 from marl_sched.envs.aec import SchedulingAEC
-from marl_sched.envs.murse.timetable import time_batch
 from marl_sched.envs.torchrl_env import SchedulingTorchRL
 from marl_sched.errors import InvalidOptionError
 from marl_sched.graph import ACTION_MASK
@@ -32,7 +29,6 @@ SCALES = ("small", "large")
 _AEC_TURNS = 5_000
 _TORCHRL_STEPS = 100
 _POLICY_DECISIONS = 200
-_ROUND = "a small instance (10 tasks, 4 agents)"
 _MEANINGS = {
     "aec_turns_per_s": "AEC turns with observations, small instance, random legal choices: last() and step()",
     "torchrl_decisions_per_s": f"decisions of a TorchRL batch of {BATCH} small instances with full observations, "
@@ -48,9 +44,9 @@ def bench(domain: Domain, *, repeats: int = 5) -> dict[str, Any]:
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        own, meanings = _OWN[domain.name](domain, repeats) if domain.name in _OWN else ({}, {})
+        own = own_benchmarks(domain, BATCH)
         figures = {
-            **own,
+            **{name: each.per_second * _best(repeats, each.prepare, each.play) for name, each in own.items()},
             "aec_turns_per_s": aec_turns_per_second(domain, repeats),
             "torchrl_decisions_per_s": torchrl_decisions_per_second(domain, repeats),
             "policy_ms": {scale: policy_milliseconds(domain, scale, repeats) for scale in SCALES},
@@ -64,30 +60,7 @@ def bench(domain: Domain, *, repeats: int = 5) -> dict[str, Any]:
         "repeats": repeats,
         "statistic": "best of repeats, CPU time",
     }
-    return {**head, **figures, "meaning": {**meanings, **_MEANINGS}}
-
-
-def hour_microseconds(domain: Domain, batch: int, repeats: int) -> float:
-    """Microseconds per simulated hour and instance of `batch` small AirME instances played to their end."""
-    simulator, choices = _prepared_hours(domain, batch)
-    return 1e6 / (batch * len(choices)) * _best(repeats, simulator.reset, lambda: _play_hours(simulator, choices))
-
-
-def _prepared_hours(domain: Domain, batch: int) -> tuple[Any, np.ndarray]:
-    """A simulator and the condition-based rule's targets for all its hours and crews, int64 (T, B, C)."""
-    simulator: Any = domain.simulator(domain.instances("small", batch, 0), pad="small")
-    rule = create_scheduler("condition", domain)
-    choices = np.zeros((domain.default_horizon, batch, simulator.max_agents), np.int64)
-    while (rows := np.flatnonzero(simulator.acting >= 0)).size:
-        targets = rule.decide(simulator)
-        choices[simulator.time[rows], rows, simulator.acting[rows]] = targets[rows]
-        simulator.step(targets)
-    return simulator, choices
-
-
-def _play_hours(simulator: Any, choices: np.ndarray) -> None:
-    for hour in choices:
-        simulator.play_hour(hour)
+    return {**head, **figures, "meaning": {**{name: each.meaning for name, each in own.items()}, **_MEANINGS}}
 
 
 def aec_turns_per_second(domain: Domain, repeats: int) -> float:
@@ -142,43 +115,3 @@ def _best(repeats: int, prepare: Callable[[], Any], play: Callable[[], Any]) -> 
         play()
         seconds.append(time.thread_time() - started)
     return min(seconds[1:])
-
-
-def _airme(domain: Domain, repeats: int) -> tuple[dict[str, float], dict[str, str]]:
-    what = "microseconds per simulated hour and small instance in play_hour(), the condition-based rule's decisions"
-    figures = {f"hour_us_b{batch}": hour_microseconds(domain, batch, repeats) for batch in (1, BATCH)}
-    return figures, dict.fromkeys(figures, f"{what} prepared beforehand")
-
-
-def _murse(domain: Domain, repeats: int) -> tuple[dict[str, float], dict[str, str]]:
-    figures = {
-        "schedule_us_b1024": schedule_microseconds(domain, BATCH, repeats),
-        "edf_large_ms": edf_milliseconds(domain, "large", repeats),
-    }
-    return figures, {
-        "schedule_us_b1024": f"microseconds per whole schedule of {_ROUND}, timed and checked, {BATCH} at a time",
-        "edf_large_ms": "milliseconds in which the rule edf makes a whole schedule, the largest of ten large instances",
-    }
-
-
-def schedule_microseconds(domain: Domain, batch: int, repeats: int) -> float:
-    """Microseconds to time and check one of `batch` whole schedules of a small MuRSE instance."""
-    instance = next(i for i in domain.instances("small", 100, 0) if (i.n_tasks, i.n_agents) == (10, 4))
-    rng = np.random.default_rng(0)
-    orders = np.stack([rng.permutation(instance.n_tasks) for _ in range(batch)])
-    doers = rng.integers(instance.n_agents, size=orders.shape)
-    problem = (instance.mean_durations, instance.lags, instance.near, instance.deadlines)
-    return 1e6 / batch * _best(repeats, lambda: None, lambda: time_batch(orders, doers, *problem))
-
-
-def edf_milliseconds(domain: Domain, scale: str, repeats: int) -> float:
-    """Milliseconds that EDF takes for a whole schedule of an instance, the largest of ten."""
-    largest = max(domain.instances(scale, 10, 0), key=lambda instance: instance.n_tasks)
-    return 1e3 * _best(repeats, lambda: None, lambda: edf_schedule(Round.of(largest)))
-
-
-# What only one domain has to measure: domain -> function of (domain, repeats) -> (figures, what they are of).
-_OWN: Mapping[str, Callable[[Domain, int], tuple[dict[str, float], dict[str, str]]]] = {
-    "airme": _airme,
-    "murse": _murse,
-}

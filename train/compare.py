@@ -35,9 +35,8 @@ def draw_timelines(path: Path, domain: Domain, episodes: Mapping[str, TurnSimula
         score = simulator.objectives()[objective][0]
         panels[f"{name}: {objective} {score:.3f}"] = domain.render["rgb_array"](simulator, 0)
         hours = max(hours, int(simulator.time[0]))
-    legend, band = domain.extras.get("legend"), domain.extras.get("band")
     title = "the same instance with the same noise"
-    return plots.save(plots.timelines(panels, hours=hours, legend=legend, band=band, title=title), path)
+    return plots.save(plots.timelines(panels, hours=hours, legend=domain.legend, band=domain.band, title=title), path)
 
 
 def draw_learning_curves(path: Path, logs: Iterable[Path]) -> Path:

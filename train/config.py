@@ -21,6 +21,7 @@ from msgspec import Meta, Struct
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from marl_sched.agents.cards import Heads, Layers, Width
 from marl_sched.domain import get_domain
 from marl_sched.errors import InvalidFileError, InvalidOptionError
 from marl_sched.files import read_json
@@ -30,6 +31,7 @@ _SET_ELSEWHERE = {"instances", "view", "objective", "horizon", "seed", "pad"}
 
 Count = Annotated[int, Meta(ge=1)]
 Natural = Annotated[int, Meta(ge=0)]
+Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]  # what marl_sched.noise takes
 Positive = Annotated[float, Meta(gt=0)]
 NonNegative = Annotated[float, Meta(ge=0)]
 Share = Annotated[float, Meta(ge=0, le=1)]
@@ -51,9 +53,9 @@ class EnvConfig(_Config, frozen=True, kw_only=True):
 class PolicyConfig(_Config, frozen=True, kw_only=True):
     """Sizes of a HetGAT network: features per head, heads per layer, layers."""
 
-    width: Count
-    heads: Count
-    layers: Count
+    width: Width
+    heads: Heads
+    layers: Layers
 
 
 class PpoConfig(_Config, frozen=True, kw_only=True):
@@ -106,7 +108,7 @@ class ValidationConfig(_Config, frozen=True, kw_only=True):
     every: Count
     instances: Count
     episodes: Count
-    seed: Natural
+    seed: Seed
     length: Count | None
 
 
@@ -119,7 +121,7 @@ class TrainConfig(_Config, frozen=True, kw_only=True):
     algorithm: GaeConfig | StepBaselineConfig
     curriculum: CurriculumConfig
     validation: ValidationConfig
-    seed: Natural
+    seed: Seed
     updates: Count
     threads: Count
     run_dir: str | None
@@ -132,7 +134,7 @@ class TrainConfig(_Config, frozen=True, kw_only=True):
 
     def make_view(self) -> Any:
         """The domain's view object that `view` describes."""
-        return _view(self)
+        return get_domain(self.env.name).make_view(self.view)
 
 
 class RunRecord(_Config, frozen=True, kw_only=True):
@@ -191,25 +193,8 @@ def _checked(config: TrainConfig) -> TrainConfig:
                 f"train: env.options.{option}: the simulator of {domain.name} has no such option to set here; "
                 f"known: {', '.join(sorted(known))}"
             )
-    _view(config)
+    config.make_view()
     return config
-
-
-def _view(config: TrainConfig) -> Any:
-    options = dict(config.view)
-    views = get_domain(config.env.name).views
-    kind = options.pop("kind", None)
-    if kind not in views:
-        raise InvalidOptionError(f"train: view.kind: expected one of {', '.join(sorted(views))}, got {kind!r}")
-    fields = msgspec.inspect.type_info(views[kind]).fields  # type: ignore[attr-defined]  # dataclasses have them
-    known = {field.name for field in fields}
-    for name in options:
-        if name not in known:
-            raise InvalidOptionError(f"train: view.{name}: the view {kind!r} has no such option")
-    try:
-        return msgspec.convert(options, views[kind])
-    except msgspec.ValidationError as error:
-        raise InvalidOptionError(f"train: view: {error}") from error
 
 
 def _one_line(error: Exception) -> str:

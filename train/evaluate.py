@@ -28,8 +28,6 @@ from marl_sched.simulation import TurnSimulator
 from marl_sched.statistics import Summary, paired_difference, percent_gain, summarise
 
 SCHEMA = 1
-# Keys of Domain.extras: the name of the reference scheduler, what the horizon counts, which M1 is the better one.
-REFERENCE, UNIT, BETTER = "reference", "unit", "better"
 EXACT = "exact"  # the scheduler that the others' gap is taken to where it plays
 SHARE_EVERY = 8  # turns between two readings of the visible share
 LOCAL_SHARE = 0.45  # a view that shows more of the graph than this is not called local
@@ -216,7 +214,7 @@ class Table:
             "env": self.domain.name,
             "scale": settings.scale,
             "objective": settings.objective,
-            "better": self.domain.extras.get(BETTER, "higher"),
+            "better": self.domain.better,
             "view": {
                 **view_as_json(settings.view),
                 "visible_share": self.visible_share,
@@ -224,7 +222,7 @@ class Table:
             },
             "instances": self.n_instances,
             "episodes": settings.episodes,
-            self.domain.extras.get(UNIT, "hours"): settings.horizon,
+            self.domain.unit: settings.horizon,
             "seed": settings.seed,
             "options": dict(settings.options),
             "baseline": {"scheduler": self.baseline[0], "view": view_as_json(self.baseline[1])},

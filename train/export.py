@@ -50,7 +50,7 @@ def export_policy(
     run_dir: Path,
     path: Path,
     *,
-    scales: Sequence[str],
+    scales: Sequence[str] | None = None,
     instances: int = 100,
     episodes: int = 10,
     seed: int = 1,
@@ -58,14 +58,14 @@ def export_policy(
 ) -> PolicyCard:
     """Measure a run's best policy, greedy, on unseen instances of each scale, and write it with those scores to `path`.
 
-    Instances and noise are those of `marl-sched evaluate --seed SEED`; `length` is the simulated time of an
-    episode, None: the environment's. Returns the card as written.
+    `scales` None: all of the domain's. Instances and noise are those of `marl-sched evaluate --seed SEED`;
+    `length` is the simulated time of an episode, None: the environment's. Returns the card as written.
     """
     network, card = load_network(run_dir / BEST)
-    domain, options = get_domain(card.domain), dict(card.view)
-    view = domain.views[options.pop("kind")](**options)
+    domain = get_domain(card.domain)
+    view = domain.make_view(card.view)
     measured = {}
-    for scale in scales:
+    for scale in domain.scales if scales is None else scales:
         settings = Settings(
             episodes=episodes, seed=seed, view=view, objective=card.objective, horizon=length, scale=scale
         )

@@ -28,10 +28,9 @@ AIRME = register(
         render_options={"rgb_array": {"record_timeline": True}},
         default_horizon=DEFAULT_HORIZON,
         telemetry=AirmeTelemetry(),
-        extras={
-            "reference": "corrective-published",  # M2 is the gain over it, section 6.5.2
-            "legend": render.LEGEND,
-            "band": ("plane", render.CELL),
-        },
+        reference="corrective-published",  # section 6.5.2
+        cli_options={"hours": "horizon", "failure": "failure", "scheme": "scheme"},
+        legend=render.LEGEND,
+        band=("plane", render.CELL),
     )
 )

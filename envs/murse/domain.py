@@ -27,6 +27,16 @@ MURSE = register(
         central=RoundSchedules(),
         render={"ansi": render.board, "rgb_array": render.gantt},
         default_horizon=DEFAULT_HORIZON,
-        extras={"modes": ("plan", "online"), "unit": "rounds", "better": "lower"},
+        unit="rounds",
+        better="lower",
+        cli_options={
+            "rounds": "horizon",
+            "mode": "mode",
+            "durations": "durations",
+            "proximity": "proximity",
+            "picking": "picking",
+        },
+        generate_accepted=generate,
+        impossibilities=MurseInstance.impossibilities,
     )
 )

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from importlib import import_module
 from importlib.util import find_spec
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from marl_sched.cli import options
 from marl_sched.errors import InvalidOptionError
+
+if TYPE_CHECKING:
+    import numpy as np
 
 
 def add_to(app: typer.Typer) -> None:
@@ -39,28 +42,21 @@ def bound(
     The crews' constraint is relaxed at a price that varies over the episode; what remains is solved exactly,
     plane by plane. Takes a minute or so per price vector.
     """
-    from rich.console import Console
-
     from marl_sched.domain import get_domain
     from marl_sched.files import write_json
 
     domain = get_domain(env)
-    module = f"marl_sched.agents.{env}_bound.relaxation"
-    if find_spec(f"marl_sched.agents.{env}_bound") is None:
-        raise InvalidOptionError(f"--env: no bound is known for the environment {env!r}")
+    chosen = domain.require_objective(objective or domain.objectives[0])
     options.check_output(json)
-    chosen = domain.require_objective(objective) if objective else domain.objectives[0]
     problems, padded_to = options.load_instances(domain, instances, scale, seed)
-    bounds = import_module(module)
-    with Console(stderr=True).status("bounding") as status:
-        relaxation = bounds.Relaxation(
-            problems, objective=chosen, horizon=hours or domain.default_horizon, failure=failure
-        )
-        found = bounds.upper_bounds(
-            relaxation,
-            price_vectors=price_vectors,
-            progress=lambda done, total: status.update(f"price vector {done + 1} of {total}"),
-        )
+    relaxation, values = _prove(
+        env,
+        problems,
+        price_vectors,
+        objective=chosen,
+        horizon=hours or domain.default_horizon,
+        failure=failure,
+    )
     result: dict[str, Any] = {
         "schema": 1,
         "env": env,
@@ -71,13 +67,35 @@ def bound(
         "hours": relaxation.horizon,
         "seed": seed,
         "price_vectors": min(price_vectors, len(problems)),
-        "M1": {"mean": float(found.value.mean()), "std": float(found.value.std())},
-        "per_instance": [float(value) for value in found.value],
+        "M1": {"mean": float(values.mean()), "std": float(values.std())},
+        "per_instance": [float(value) for value in values],
     }
     if json is not None:
         write_json(json, result)
-    typer.echo(
-        f"{env}, {padded_to or 'given'} instances: no scheduler's expected M1 for {chosen} passes "
-        f"{result['M1']['mean']:.4f} ± {result['M1']['std']:.4f} "
-        f"({len(problems)} instances, {relaxation.horizon} hours)"
+    typer.echo(_sentence(result))
+
+
+def _prove(env: str, problems: list[Any], price_vectors: int, **settings: Any) -> tuple[Any, np.ndarray]:
+    """The relaxation of a domain's problems and the bound of each, float64 (B,); a spinner tells how far it is."""
+    from rich.console import Console
+
+    package = f"marl_sched.agents.{env}_bound"
+    if find_spec(package) is None:
+        raise InvalidOptionError(f"--env: no bound is known for the environment {env!r}")
+    bounds = import_module(f"{package}.relaxation")
+    with Console(stderr=True).status("bounding") as status:
+        relaxation = bounds.Relaxation(problems, **settings)
+        found = bounds.upper_bounds(
+            relaxation,
+            price_vectors=price_vectors,
+            progress=lambda done, total: status.update(f"price vector {done + 1} of {total}"),
+        )
+    return relaxation, found.value
+
+
+def _sentence(result: dict[str, Any]) -> str:
+    return (
+        f"{result['env']}, {result['scale'] or 'given'} instances: no scheduler's expected M1 for "
+        f"{result['objective']} passes {result['M1']['mean']:.4f} ± {result['M1']['std']:.4f} "
+        f"({result['instances']} instances, {result['hours']} hours)"
     )

@@ -163,8 +163,11 @@ def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
 
 def print_report(report: dict[str, Any]) -> None:
     """The end of a run in a few lines."""
+    from marl_sched.domain import get_domain
+
     latency, messages = report["latency_ms"], report["messages"]
-    typer.echo(f"{report['hours']} hours, {len(report['agents'])} agents, {len(report['decisions'])} decisions")
+    unit = get_domain(report["env"]).unit
+    typer.echo(f"{report['hours']} {unit}, {len(report['agents'])} agents, {len(report['decisions'])} decisions")
     typer.echo(f"M1 ({report['objective']}): {report['M1']:.4f}")
     typer.echo(f"{messages['count']} messages, {messages['bytes']} bytes")
     if latency["p50"] is not None:

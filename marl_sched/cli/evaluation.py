@@ -77,10 +77,9 @@ def play(resolved: Resolved, baseline: str | None) -> dict[str, Any]:
     from rich.progress import Progress
 
     from marl_sched.agents.registry import create_scheduler
-    from marl_sched.train.evaluate import REFERENCE, evaluate
+    from marl_sched.train.evaluate import evaluate
 
     domain = resolved.domain
-    reference = domain.extras.get(REFERENCE)
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         tasks: dict[str, Any] = {}
@@ -95,7 +94,7 @@ def play(resolved: Resolved, baseline: str | None) -> dict[str, Any]:
             resolved.schedulers,
             resolved.instances,
             resolved.settings,
-            reference=create_scheduler(reference, domain) if reference else None,
+            reference=create_scheduler(domain.reference, domain) if domain.reference else None,
             baseline=baseline,
             progress=tell,
         )
@@ -105,7 +104,7 @@ def play(resolved: Resolved, baseline: str | None) -> dict[str, Any]:
 def bench(
     env: options.Env = "airme",
     json: options.JsonFile = None,
-    repeats: Annotated[int, typer.Option("--repeats", min=1, help="Measurements; the median is reported.")] = 5,
+    repeats: Annotated[int, typer.Option("--repeats", min=1, help="Measurements; the best is reported.")] = 5,
 ) -> None:
     """Measure how fast the simulator, its faces and the policy are on this machine, on one thread."""
     from marl_sched.cli.tables import print_bench

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from marl_sched.errors import InvalidFileError, InvalidOptionError, require
+from marl_sched.errors import InvalidFileError, InvalidOptionError
 
 if TYPE_CHECKING:
     from marl_sched.domain import Domain
 
 Env = Annotated[str, typer.Option("--env", help="The environment; `marl-sched list` shows all.")]
 Scale = Annotated[str, typer.Option("--scale", help="Size of generated instances.")]
-Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of instances and noise.")]
+Seed = Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="Seed of instances and noise.")]
 Hours = Annotated[int | None, typer.Option("--hours", min=1, help="airme: hours of an episode (default 720).")]
 View = Annotated[str, typer.Option("--view", help="What an acting agent sees: full or local.")]
 Reach = Annotated[
@@ -36,46 +35,22 @@ Sensing = Annotated[
 JsonFile = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the results here.")]
 
 VIEW_OPTIONS = ("reach", "comm", "staleness", "sensing")
-# Options that only some environments have: option -> environment -> the simulator's argument. Given to another
-# environment an option is an error.
-SIMULATOR_OPTIONS: Mapping[str, Mapping[str, str]] = {
-    "hours": {"airme": "horizon"},
-    "failure": {"airme": "failure"},
-    "scheme": {"airme": "scheme"},
-    "rounds": {"murse": "horizon"},
-    "mode": {"murse": "mode"},
-    "durations": {"murse": "durations"},
-    "proximity": {"murse": "proximity"},
-    "picking": {"murse": "picking"},
-}
+# Options that only some environments have: `Domain.cli_options` says which. Given to another one they are errors.
+SIMULATOR_OPTIONS = ("hours", "rounds", "failure", "scheme", "mode", "durations", "proximity", "picking")
 
 
-def build_view(domain: Domain, name: str, options: Mapping[str, Any]) -> Any:
-    """The domain's view of that name with the options that were given; None means not given.
-
-    Raises UnknownNameError for a view that the domain does not have and InvalidOptionError for an option that
-    the view does not have.
-    """
-    kind = domain.views[require(f"view of {domain.name}", name, domain.views)]
-    types = get_type_hints(kind)
-    known = [field.name for field in fields(kind)]
-    given = _given(options)
-    for option, value in given.items():
-        if option not in known:
-            has = ", ".join(f"--{field}" for field in known) or "no options"
-            raise InvalidOptionError(f"--{option}: the view {name!r} of {domain.name} has {has}")
-        if types[option](value) != value:
-            raise InvalidOptionError(f"--{option}: expected an integer, got {value}")
-    return kind(**{option: types[option](value) for option, value in given.items()})
+def build_view(domain: Domain, kind: str, options: Mapping[str, Any]) -> Any:
+    """The domain's view of that kind with the options that are not None; raises as `Domain.view`."""
+    return domain.view(kind, **_given(options))
 
 
 def simulator_options(domain: Domain, options: Mapping[str, Any]) -> dict[str, Any]:
     """The simulator's arguments for the options that were given; InvalidOptionError for another domain's option."""
     given = _given(options)
     for name in given:
-        if domain.name not in SIMULATOR_OPTIONS[name]:
+        if name not in domain.cli_options:
             raise InvalidOptionError(f"--{name}: the environment {domain.name!r} has no such option")
-    return {SIMULATOR_OPTIONS[name][domain.name]: value for name, value in given.items()}
+    return {domain.cli_options[name]: value for name, value in given.items()}
 
 
 def load_instances(domain: Domain, source: str, scale: str, seed: int) -> tuple[list[Any], str | None]:
@@ -95,6 +70,13 @@ def load_instances(domain: Domain, source: str, scale: str, seed: int) -> tuple[
     if not paths:
         raise InvalidFileError(folder, "", "at least one instance file (*.json)")
     return [domain.load(path) for path in paths], None
+
+
+def warn_of_impossible(domain: Domain, instances: Mapping[str, Any]) -> None:
+    """Say on stderr, in a line for each instance by its caption, why nothing can solve it, if that is known."""
+    for caption, instance in instances.items():
+        if reasons := domain.impossibilities(instance):
+            typer.echo(f"warning: {caption}: no schedule can be feasible: {'; '.join(reasons)}", err=True)
 
 
 def check_output(path: Path | None, option: str = "--json") -> None:

@@ -38,14 +38,17 @@ def generate(
     options.check_folder(out)
     digits = len(str(count - 1))
     for i, instance in enumerate(domain.instances(scale, count, seed)):
-        instance.save(out / f"{env}-{scale}-{seed}-{i:0{digits}}.json")
+        path = out / f"{env}-{scale}-{seed}-{i:0{digits}}.json"
+        instance.save(path)
+        options.warn_of_impossible(domain, {path.name: instance})
     typer.echo(f"{count} {scale} {env} instances in {out}")
 
 
 def _solvable(domain: Domain) -> Domain:
-    """A domain that generates only instances that the exact solver solves; InvalidOptionError if it has none."""
-    if domain.name != "murse":
-        raise InvalidOptionError(f"--feasible: the environment {domain.name!r} has no infeasible instances")
-    from marl_sched.agents.murse.optimal import is_feasible
+    """A domain that generates only instances that its solver solves; InvalidOptionError if it needs none."""
+    from marl_sched.agents.registry import feasibility
 
-    return replace(domain, generate=lambda scale, rng: domain.generate(scale, rng, is_feasible))  # type: ignore[call-arg]  # MuRSE's
+    draw, accept = domain.generate_accepted, feasibility(domain.name)
+    if draw is None or accept is None:
+        raise InvalidOptionError(f"--feasible: the environment {domain.name!r} has no infeasible instances")
+    return replace(domain, generate=lambda scale, rng: draw(scale, rng, accept))

@@ -75,6 +75,7 @@ class Selection:
         )
         schedulers = create_schedulers(domain, self.schedulers)
         instances, scale = options.load_instances(domain, self.instances, self.scale, self.seed)
+        options.warn_of_impossible(domain, {f"instance {i}": instance for i, instance in enumerate(instances)})
         return Resolved(domain, schedulers, instances, replace(settings, scale=scale))
 
 

@@ -41,20 +41,35 @@ def fleet(tmp_path):
         (("--schedulers", "condition", "--scale", "huge"), ["unknown scale of airme 'huge'", "large, medium, small"]),
         (("--schedulers", "condition", "--env", "airma"), ["unknown environment 'airma'", "did you mean 'airme'"]),
         (("--schedulers", "condition", "--rounds", "3"), ["--rounds: the environment 'airme' has no such option"]),
-        (("--schedulers", "condition", "--view", "local", "--comm", "1.5"), ["--comm: expected an integer, got 1.5"]),
-        (("--schedulers", "condition", "--view", "local", "--sensing", "2"), ["--sensing", "--staleness"]),
+        (
+            ("--schedulers", "condition", "--view", "local", "--comm", "1.5"),
+            ["view local: comm: expected an integer, got 1.5"],
+        ),
+        (
+            ("--schedulers", "condition", "--view", "local", "--sensing", "2"),
+            ["view local: sensing: ", "reach, comm, staleness"],
+        ),
+        (("--schedulers", "condition", "--view", "local", "--comm", "nan"), ["comm: expected an integer, got nan"]),
+        (("--schedulers", "condition", "--view", "local", "--comm", "inf"), ["comm: expected an integer, got inf"]),
         (("--schedulers", "condition", "--objective", "fame"), ["unknown objective of airme 'fame'"]),
         (("--schedulers", "condition", "--baseline", "random"), ["unknown baseline 'random'", "condition"]),
         (("--schedulers", "condition", "--failure", "never"), ["failure", "'density' or 'hazard'", "'never'"]),
         (("--schedulers", "condition", "--scheme", "half"), ["unknown scheme 'half'"]),
-        (("--schedulers", "condition", "--view", "local", "--reach", "-1"), ["reach", ">= 0", "-1"]),
+        (
+            ("--schedulers", "condition", "--view", "local", "--reach", "-1"),
+            ["view local: reach: expected an integer", "-1"],
+        ),
         (("--schedulers", "condition", "--view", "local", "--reach", "near"), ["--reach"]),
-        (("--schedulers", "condition", "--reach", "1"), ["--reach", "the view 'full' of airme has no options"]),
+        (
+            ("--schedulers", "condition", "--reach", "1"),
+            ["view full: reach: expected an option of this view of airme: none"],
+        ),
         (("--schedulers", "condition", "--instances", "0"), ["--instances: expected at least 1, got 0"]),
         (("--schedulers", "condition", "--instances", "nowhere"), ["--instances", "'nowhere'"]),
         (("--schedulers", "condition", "--episodes", "0"), ["--episodes"]),
         (("--schedulers", "condition", "--hours", "0"), ["--hours"]),
         (("--schedulers", "condition", "--seed", "-1"), ["--seed"]),
+        (("--schedulers", "condition", "--seed", "9223372036854775808"), ["--seed", "9223372036854775807"]),
         (("--schedulers", "condition", "--colour", "red"), ["No such option: --colour"]),
         ((), ["Missing option '--schedulers'"]),
     ],
@@ -160,7 +175,7 @@ def test_a_training_log_that_is_none_is_refused_before_the_work(run, tmp_path, c
     [
         (("--policy", "nobody"), ["unknown scheduler 'nobody'"]),
         (("--policy", "condition", "--view", "globe"), ["unknown view of airme 'globe'"]),
-        (("--policy", "condition", "--reach", "1"), ["--reach"]),
+        (("--policy", "condition", "--reach", "1"), ["view full: reach: expected an option"]),
         (("--policy", "condition", "--scale", "huge"), ["unknown scale of airme 'huge'"]),
         (("--policy", "condition", "--instance", "nowhere.json"), ["nowhere.json"]),
         (("--policy", "condition", "--deadline", "0"), ["deadline"]),
@@ -197,7 +212,18 @@ def test_a_negative_agent_is_refused(run):
 
 
 @pytest.mark.parametrize(
-    "overrides", [["view=globe"], ["env=boats"], ["updates=many"], ["colour=red"], ["env.scales=[huge]"]]
+    "overrides",
+    [
+        ["view=globe"],
+        ["env=boats"],
+        ["updates=many"],
+        ["colour=red"],
+        ["env.scales=[huge]"],
+        ["seed=100000000000000000000000"],
+        ["seed=9223372036854775808"],
+        ["validation.seed=9223372036854775808"],
+        ["policy.width=1000000000"],
+    ],
 )
 def test_train_refuses_a_bad_override(run, tmp_path, overrides):
     refused(run("train", f"run_dir={tmp_path / 'run'}", *overrides))

@@ -46,5 +46,5 @@ def test_the_bench_measures_schedules_and_edf(run, tmp_path, monkeypatch):
         monkeypatch.setattr(bench, name, value)
     assert run("bench", "--env", "murse", "--repeats", 1, "--json", tmp_path / "b.json").code == 0
     figures = json.loads((tmp_path / "b.json").read_text())
-    names = ("schedule_us_b1024", "edf_large_ms", "aec_turns_per_s", "torchrl_decisions_per_s")
+    names = ("schedule_us_b3", "edf_large_ms", "aec_turns_per_s", "torchrl_decisions_per_s")
     assert all(figures[name] > 0 and figures["meaning"][name] for name in names)

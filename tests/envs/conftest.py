@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from marl_sched.domain import Domain, get_domain
-from marl_sched.envs.options import as_view
 
 DOMAINS = ("airme", "murse")
 
@@ -55,14 +54,14 @@ def padded(domain: Domain) -> object:
     """A small instance with fewer agents and targets than the padding allows."""
     for instance in domain.instances("small", 50, seed=0):
         simulator = make_simulator(domain, [instance])
-        own = domain.simulator([instance], view=as_view(domain, None))
+        own = domain.simulator([instance], view=domain.make_view(None))
         if own.max_agents < simulator.max_agents and own.max_targets < simulator.max_targets:
             return instance
     raise AssertionError("none of 50 instances is smaller than the padding")
 
 
 def make_simulator(domain: Domain, instances: list[object], **options: object):
-    return domain.simulator(instances, view=as_view(domain, None), pad="small", **options)
+    return domain.simulator(instances, view=domain.make_view(None), pad="small", **options)
 
 
 @pytest.fixture

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from marl_sched.agents.airme_bench import play_hours, prepared_hours
 from marl_sched.domain import get_domain
 from marl_sched.errors import InvalidOptionError
 from marl_sched.train import bench
@@ -33,10 +34,10 @@ def test_the_figures_have_the_names_that_other_tools_read_and_say_what_they_are_
 
 
 def test_the_prepared_hours_replay_the_rules_own_episode():
-    simulator, choices = bench._prepared_hours(AIRME, 2)
+    simulator, choices = prepared_hours(AIRME, 2)
     expected = simulator.objectives()["profit"].copy()
     simulator.reset(seed=0)
-    bench._play_hours(simulator, choices)
+    play_hours(simulator, choices)
     np.testing.assert_array_equal(simulator.objectives()["profit"], expected)
     assert simulator.over.all()
 

@@ -38,7 +38,7 @@ def test_published_curriculum_is_the_dissertations():
         ("rounds=3", "rounds"),
         ("+rounds=3", "unknown field `rounds`"),
         ("+algorithm.lambda=1", "unknown field `lambda` - at `$.algorithm`"),
-        ("+view.reach=1", "view.reach: the view 'full' has no such option"),
+        ("+view.reach=1", "view full: reach: expected an option of this view of airme: none"),
         ("algorithm.ppo.epochs=0", "`int` >= 1 - at `$.algorithm.ppo.epochs`"),
         ("seed=many", "Expected `int`, got `str` - at `$.seed`"),
         ("+env.options.speed=2", "env.options.speed: the simulator of airme has no such option"),
