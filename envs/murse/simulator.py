@@ -13,11 +13,12 @@ from marl_sched.envs.murse.generate import SCALES
 from marl_sched.envs.murse.instance import DURATIONS, PROXIMITY, MurseInstance
 from marl_sched.envs.murse.state import NOBODY, load_instance, new_state
 from marl_sched.envs.murse.views import FullView, LocalView
-from marl_sched.errors import IllegalActionError, InvalidOptionError, require
-from marl_sched.noise import episode_key
+from marl_sched.errors import IllegalActionError, InvalidOptionError, require, require_integer
+from marl_sched.noise import as_seed, episode_key
 from marl_sched.simulation import Observation, TurnSimulator
 
 DEFAULT_HORIZON = 10
+MOST_ROUNDS = 100_000  # of an episode: results are kept for every round
 DEFAULT_MULTIPLIER = 2.0
 
 
@@ -67,8 +68,7 @@ class MurseSimulator(TurnSimulator):
     ) -> None:
         if not instances:
             raise InvalidOptionError("instances: expected at least one")
-        if horizon < 1:
-            raise InvalidOptionError(f"horizon: expected at least 1 round, got {horizon}")
+        require_integer("horizon", horizon, 1, MOST_ROUNDS, "rounds")
         for name, value in (("multiplier", multiplier), ("divisor", divisor)):
             if not 1.0 <= value < float("inf"):
                 raise InvalidOptionError(f"{name}: expected a number >= 1, got {value}")
@@ -91,7 +91,7 @@ class MurseSimulator(TurnSimulator):
         self.batch = len(self.instances)
         self._allocate(pad, graph.SIMPLIFICATIONS.index(simplification))
         self._loaded: list[MurseInstance | None] = [None] * self.batch
-        self._seeds = np.full(self.batch, seed, np.int64)
+        self._seeds = np.zeros(self.batch, np.int64)
         self._episodes = np.full(self.batch, -1, np.int64)
         self.reset(seed=seed)
 
@@ -133,7 +133,7 @@ class MurseSimulator(TurnSimulator):
         for b, instance in zip(chosen, instances or [], strict=False):
             self.instances[b] = self._with_settings(instance)
         if seed is not None:
-            self._seeds[chosen] = seed
+            self._seeds[chosen] = as_seed(seed)
             self._episodes[chosen] = 0
         else:
             self._episodes[chosen] += 1
