@@ -131,7 +131,7 @@ def test_frozen_agent_is_given_up_and_comes_back_as_another_incarnation():
 @pytest.mark.slow
 @needs_proc
 def test_agents_outlive_their_world_and_serve_its_successor(in_process):
-    given = world(hours=100)
+    given = world(hours=300)
     with Deployment(DeployOptions(world=given, policy="condition")) as deployment:
         wait_until(lambda: deployment.moment >= 10)
         deployment.children["world"].process.kill()

@@ -37,5 +37,5 @@ def test_host_that_does_not_exist_is_said_to_be_the_reason():
 
 def test_refused_connection_is_said_to_be_the_reason():
     endpoint = settle_port("tcp/127.0.0.1:0")
-    with pytest.raises(DeploymentError, match="within 0.1 s: Connection refused"):
+    with pytest.raises(DeploymentError, match=r"within 0\.1 s: Connection refused"):
         spoke("run", endpoint, 0.1).__enter__()
