@@ -7,8 +7,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from marl_sched.domain import Domain, get_domain
 from marl_sched.errors import InvalidOptionError
 
@@ -26,13 +24,6 @@ def as_instance(domain: Domain, instance: Any) -> Any:
         expected = domain.instance_type.__name__
         raise InvalidOptionError(f"instance: expected {expected} or a file's path, got {type(instance).__name__}")
     return instance
-
-
-def as_seed(seed: Any) -> int:
-    """A seed as int in [0, 2**63); InvalidOptionError otherwise."""
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not 0 <= seed < 2**63:
-        raise InvalidOptionError(f"seed: expected an integer in [0, 2**63), got {seed!r}")
-    return int(seed)
 
 
 def all_options(face: Callable[..., Any], given: Mapping[str, Any]) -> dict[str, Any]:

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from marl_sched.domain import Domain
-from marl_sched.envs.options import as_domain, as_instance, as_seed
+from marl_sched.envs.options import as_domain, as_instance
 from marl_sched.errors import IllegalActionError, InvalidOptionError, require
 from marl_sched.graph import ACTION_MASK
+from marl_sched.noise import as_seed
 from marl_sched.simulation import Observation
 
 # PettingZoo's conformance kit passes {"options": 1} to every reset and expects to be heard out.

@@ -30,10 +30,11 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, TensorSpec, Un
 from torchrl.envs import EnvBase
 
 from marl_sched.domain import Domain
-from marl_sched.envs.options import as_domain, as_instance, as_seed
+from marl_sched.envs.options import as_domain, as_instance
 from marl_sched.envs.sampling import first_illegal, random_legal
 from marl_sched.errors import IllegalActionError, InvalidOptionError
 from marl_sched.graph import ACTION_MASK, ArraySpec
+from marl_sched.noise import as_seed
 
 _CPU = torch.device("cpu")
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, get_type_hints
 import numpy as np
 
 from marl_sched.errors import InvalidOptionError, require
+from marl_sched.noise import as_seed
 
 if TYPE_CHECKING:
     from gymnasium.spaces import Space
@@ -149,8 +150,12 @@ class Domain:
         return f"{self.agent_prefix}_{agent}"
 
     def instances(self, scale: str, count: int, seed: int) -> list[Any]:
-        """`count` instances of a scale; instance i depends on (seed, i) alone."""
+        """`count` instances of a scale; instance i depends on (seed, i) alone.
+
+        Raises UnknownNameError for the scale, InvalidOptionError for a seed outside [0, 2**63).
+        """
         self.require_scale(scale)
+        seed = as_seed(seed)
         return [self.generate(scale, np.random.default_rng([seed, i])) for i in range(count)]
 
     def require_scale(self, scale: str) -> str:
