@@ -4,7 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from marl_sched.agents.cards import read_card
 from marl_sched.agents.hetgat.policy import HetGATPolicy
+from marl_sched.cli.app import run as run_command
 from marl_sched.domain import get_domain
 from marl_sched.envs.airme.views import LocalView
 from marl_sched.train.evaluate import Settings, evaluate_scheduler
@@ -30,3 +32,30 @@ def test_the_card_holds_what_an_evaluation_with_that_seed_measures(tmp_path: Pat
     assert card.scores["small"]["visible_share"] == pytest.approx(scores.visible_share)
     assert card.scores["validation"]["scale"] == "small"
     assert card.command == "marl-sched train " + " ".join(TINY)
+
+
+def test_the_command_writes_a_policy_with_scores_of_every_scale(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    run = train_from_overrides([*TINY, f"run_dir={tmp_path / 'run'}"], quiet=True)
+    few = ["--instances", "1", "--episodes", "1", "--length", "10", "--seed", "5"]
+    assert run_command(["export", str(run), "mine", "--out", str(tmp_path / "out"), *few]) == 0
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["mine.json", "mine.safetensors"]
+    card = read_card(tmp_path / "out" / "mine.json")
+    told = capsys.readouterr().out
+    for scale in ("small", "medium", "large"):
+        measured = card.scores[scale]
+        assert (measured["instances"], measured["episodes"], measured["seed"]) == (1, 1, 5)
+        assert f"{scale}: M1 {measured['M1']:.4f}" in told
+    assert card.git_hash == read_card(run / "policy.json").git_hash
+    assert HetGATPolicy.load(tmp_path / "out" / "mine.safetensors").name == "mine"
+
+
+@pytest.mark.parametrize("name", ["a/b", "mine.json", "", ".."])
+def test_the_command_refuses_what_is_no_name(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert run_command(["export", str(tmp_path), name, "--out", str(tmp_path / "out")]) == 2
+    assert "NAME: expected" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_command_refuses_a_folder_without_a_policy(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert run_command(["export", str(tmp_path), "mine", "--out", str(tmp_path / "out")]) == 2
+    assert "policy.json" in capsys.readouterr().err
