@@ -1,9 +1,13 @@
 """MuRSE on the command line: solvable problems, schedulers side by side, speed."""
 
 import json
+from dataclasses import replace
+
+import numpy as np
 
 from marl_sched.agents.murse.exact import solve
 from marl_sched.agents.murse.problem import Round
+from marl_sched.domain import get_domain
 from marl_sched.envs.murse.reading import load
 from marl_sched.train import bench
 
@@ -48,3 +52,15 @@ def test_the_bench_measures_schedules_and_edf(run, tmp_path, monkeypatch):
     figures = json.loads((tmp_path / "b.json").read_text())
     names = ("schedule_us_b3", "edf_large_ms", "aec_turns_per_s", "torchrl_decisions_per_s")
     assert all(figures[name] > 0 and figures["meaning"][name] for name in names)
+
+
+def test_a_hopeless_instance_is_told_in_one_line_on_stderr(run, tmp_path):
+    solvable = get_domain("murse").instances("small", 1, 0)[0]
+    solvable.save(tmp_path / "a.json")
+    replace(solvable, deadlines=np.ones_like(solvable.deadlines)).save(tmp_path / "b.json")
+    ended = run(
+        "evaluate", "--env", "murse", "--rounds", 1, "--instances", tmp_path, "--episodes", 1, "--schedulers", "edf"
+    )
+    assert ended.code == 0
+    assert ended.err.count("\n") == 1
+    assert ended.err.startswith("warning: instance 1: no schedule can be feasible: task 1: deadline 1 but no finish")
