@@ -97,6 +97,7 @@ class SchedulingTorchRL(EnvBase):
             **options,
         )
         self._mask = np.zeros((rows, self.simulator.max_targets), np.int8)
+        self._scratch = self.simulator.new_observation()
         self._layout = [(name, (rows, *s.shape), _torch_dtype(s.dtype)) for name, s in self.simulator.arrays.items()]
         self._make_specs()
 
@@ -142,12 +143,20 @@ class SchedulingTorchRL(EnvBase):
         return self._tensordict(self._observed())
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Start new episodes in rows that are done, as EnvBase does; looking again costs less than merging rows."""
+        """Start new episodes in the rows that are done, as EnvBase does, and look again in those rows alone."""
         rows = tensordict.get("done").reshape(self.batch_size).cpu().numpy()
         if not rows.any():
             return tensordict
         self._start(rows)
-        return tensordict.update(self._tensordict(self._observed()))
+        self.simulator.observe(np.where(rows, self.simulator.acting, -1), self._scratch)
+        self._mask[rows] = self._scratch[ACTION_MASK][rows]
+        index = torch.from_numpy(np.flatnonzero(rows))
+        entries = self._books()
+        for name, _, _ in self._layout:
+            seen = tensordict.get(name).cpu().clone()  # the finished step keeps its own tensors
+            seen[index] = torch.from_numpy(self._scratch[name])[index]
+            entries[name] = seen
+        return tensordict.update(self._tensordict(entries))
 
     def _start(self, rows: np.ndarray) -> None:
         """Begin the next episode of `rows`, bool (B,)."""
@@ -178,6 +187,11 @@ class SchedulingTorchRL(EnvBase):
         arrays = {name: tensor.numpy() for name, tensor in out.items()}
         simulator.observe(simulator.acting, arrays)
         np.copyto(self._mask, arrays[ACTION_MASK])
+        return out | self._books()
+
+    def _books(self) -> dict[str, torch.Tensor]:
+        """Who acts, what the last step let happen and who is done, in fresh tensors."""
+        simulator, out = self.simulator, {}
         out["acting"] = torch.from_numpy(simulator.acting.copy())
         out["elapsed"] = torch.from_numpy(simulator.elapsed.copy())
         out["conflict"] = torch.from_numpy(simulator.conflict.copy())
