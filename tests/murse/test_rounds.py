@@ -227,7 +227,10 @@ def test_failing_never_pays_better_than_finishing(instance, mode, rewards, objec
 @given(instances(), st.sampled_from(["plan", "online"]), st.integers(0, 3))
 @settings(max_examples=60)
 def test_every_episode_ends_however_idle_the_team(instance, mode, seed):
-    play_randomly(MurseSimulator([instance], mode=mode), seed, idleness=5.0)
+    simulator = MurseSimulator([instance], mode=mode)
+    play_randomly(simulator, seed, idleness=5.0)
+    assert simulator.over.all()
+    assert len(simulator.round_results(0)) == min(instance.n_rounds, simulator.horizon)
 
 
 def test_job_shop_operations_run_on_their_machines_in_the_order_of_their_jobs(tmp_path):
