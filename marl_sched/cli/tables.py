@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from typing import Any
 
 from rich import box
@@ -10,6 +11,8 @@ from rich.table import Table
 
 _WIDE = 110  # columns of a terminal
 _ALWAYS = ("feasible",)  # without which M1 says little
+_NAME_WIDTH = 24  # columns for a scheduler's name and what is said of it
+_LARGE = 10  # from here on a decimal is enough
 
 
 def print_scores(results: dict[str, Any]) -> None:
@@ -25,12 +28,12 @@ def print_scores(results: dict[str, Any]) -> None:
     for name, row in sorted(results["schedulers"].items(), key=lambda item: item[1]["M1"]["mean"], reverse=not lower):
         m1, difference = row["M1"], row["difference"]
         cells = [
-            f"{m1['mean']:.4f}\n± {m1['std']:.3f}",
-            f"{m1['iqm']:.4f}\n{_interval(m1['ci95'])}",
-            f"{difference['mean']:+.4f}\n{_interval(difference['ci95'])}",
+            f"{_number(m1['mean'], 4)}\n± {_number(m1['std'], 3)}",
+            f"{_number(m1['iqm'], 4)}\n{_interval(m1['ci95'])}",
+            f"{_number(difference['mean'], 4, '+')}\n{_interval(difference['ci95'])}",
         ]
         cells += [f"{row[name]['mean']:.1f}\n± {row[name]['std']:.1f}" for name in ("M2",) if gain]
-        cells += [f"{row[measure]['mean']:.4f}\n± {row[measure]['std']:.3f}" for measure in measures]
+        cells += [f"{_number(row[measure]['mean'], 4)}\n± {_number(row[measure]['std'], 3)}" for measure in measures]
         table.add_row("\n".join([name, *_notes(results, row)]), *cells)
     console.print(table)
 
@@ -40,7 +43,7 @@ def _notes(results: dict[str, Any], row: dict[str, Any]) -> list[str]:
     notes = [f"({row['needs']})"] if row["needs"] else []
     if results["view"]["kind"] != "full" and not row["local"]:
         notes.append(f"(sees {100 * row['visible_share']:.0f} %: not local)")
-    return notes
+    return [line for note in notes for line in textwrap.wrap(note, _NAME_WIDTH)]
 
 
 def _title(results: dict[str, Any]) -> str:
@@ -88,4 +91,9 @@ def _other_measures(results: dict[str, Any]) -> list[str]:
 
 
 def _interval(bounds: list[float] | None) -> str:
-    return "" if bounds is None else f"[{bounds[0]:.3f}, {bounds[1]:.3f}]"
+    return "" if bounds is None else f"[{_number(bounds[0], 3)}, {_number(bounds[1], 3)}]"
+
+
+def _number(value: float, decimals: int, sign: str = "") -> str:
+    """A score with its decimals: shares need them, makespans do not."""
+    return f"{value:{sign}.{1 if abs(value) >= _LARGE else decimals}f}"
