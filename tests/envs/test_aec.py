@@ -8,8 +8,7 @@ from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 from marl_sched import airme_v0
 from marl_sched.envs.aec import SchedulingAEC
 from marl_sched.errors import IllegalActionError, InvalidOptionError, UnknownNameError
-
-HORIZON = {"airme": 40, "murse": 2}  # hours, rounds
+from tests.envs.problems import HORIZON
 
 
 def make(domain, **options):

@@ -10,28 +10,15 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import marl_sched
-from marl_sched.envs.airme.instance import AirmeInstance
 from marl_sched.envs.gymnasium_env import SchedulingEnv
 from marl_sched.errors import IllegalActionError, InvalidOptionError, UnknownNameError
+from tests.envs.problems import HORIZON, fleet
 
-HORIZON = {"airme": 40, "murse": 2}  # hours, rounds
 IDS = {"airme": "marl_sched/AirME-v0", "murse": "marl_sched/MuRSE-v0"}
 
 
 def make(domain, **options):
     return SchedulingEnv(domain, **{"horizon": HORIZON[getattr(domain, "name", domain)], **options})
-
-
-def fleet(n_planes, n_crews):
-    """Healthy aircraft of one type."""
-    return AirmeInstance(
-        n_crews=n_crews,
-        kind=np.zeros(n_planes, int),
-        income=np.full(n_planes, 10.0),
-        hours=np.full(n_planes, 24),
-        landings=np.full(n_planes, 3),
-        broken=np.zeros(n_planes, bool),
-    )
 
 
 def test_passes_gymnasiums_checker_under_its_registered_name(domain):

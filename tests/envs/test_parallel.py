@@ -6,28 +6,14 @@ import numpy as np
 import pytest
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 
-from marl_sched.envs.airme.instance import AirmeInstance
 from marl_sched.envs.parallel import SchedulingParallel
 from marl_sched.errors import IllegalActionError, InvalidOptionError, UnknownNameError
 from marl_sched.noise import Stream, moment_key, uniform
-
-HORIZON = {"airme": 40, "murse": 2}  # hours, rounds
+from tests.envs.problems import HORIZON, fleet
 
 
 def make(domain, **options):
     return SchedulingParallel(domain, **{"horizon": HORIZON[getattr(domain, "name", domain)], **options})
-
-
-def fleet(n_planes, n_crews):
-    """Healthy aircraft of one type."""
-    return AirmeInstance(
-        n_crews=n_crews,
-        kind=np.zeros(n_planes, int),
-        income=np.full(n_planes, 10.0),
-        hours=np.full(n_planes, 24),
-        landings=np.full(n_planes, 3),
-        broken=np.zeros(n_planes, bool),
-    )
 
 
 def winner(env, target, agents):

@@ -13,8 +13,7 @@ from torchrl.envs.utils import check_env_specs  # noqa: E402
 from marl_sched.envs.sampling import random_legal  # noqa: E402
 from marl_sched.envs.torchrl_env import SchedulingTorchRL  # noqa: E402
 from marl_sched.errors import IllegalActionError, InvalidOptionError, UnknownNameError  # noqa: E402
-
-HORIZON = {"airme": 40, "murse": 2}  # hours, rounds
+from tests.envs.problems import HORIZON  # noqa: E402
 
 
 def make(domain, **options):

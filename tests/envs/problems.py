@@ -1,0 +1,21 @@
+"""Problems that the tests of several faces play."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from marl_sched.envs.airme.instance import AirmeInstance
+
+HORIZON = {"airme": 40, "murse": 2}  # hours, rounds
+
+
+def fleet(n_planes, n_crews):
+    """Healthy aircraft of one type."""
+    return AirmeInstance(
+        n_crews=n_crews,
+        kind=np.zeros(n_planes, int),
+        income=np.full(n_planes, 10.0),
+        hours=np.full(n_planes, 24),
+        landings=np.full(n_planes, 3),
+        broken=np.zeros(n_planes, bool),
+    )
