@@ -23,14 +23,34 @@ SCHEMA = 1
 Width = Annotated[int, Meta(ge=1, le=1024)]
 Heads = Annotated[int, Meta(ge=1, le=64)]
 Layers = Annotated[int, Meta(ge=1, le=32)]
+Slots = Annotated[int, Meta(ge=1, le=65536)]
+_ARCHITECTURE = "architecture"
 
 
-class Sizes(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class HetGATSizes(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field=_ARCHITECTURE, tag="hetgat"):
     """Sizes of a HetGAT network: features per head, heads per layer, layers."""
 
     width: Width
     heads: Heads
     layers: Layers
+
+
+class DecimaSizes(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field=_ARCHITECTURE, tag="decima"):
+    """Sizes of Decima's networks f, g and q: features of a layer, layers of each."""
+
+    hidden: Width
+    layers: Layers
+
+
+class DeepRMSizes(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field=_ARCHITECTURE, tag="deeprm"):
+    """Sizes of a DeepRM network: features of a layer, layers, and the slots of every node type that it reads."""
+
+    hidden: Width
+    layers: Layers
+    slots: dict[str, Slots]
+
+
+Sizes = HetGATSizes | DecimaSizes | DeepRMSizes
 
 
 class PolicyCard(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -41,7 +61,7 @@ class PolicyCard(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         objective: the reward it was trained for.
         view: what an agent saw in training: `{"kind": "local", "reach": 1, ...}`.
         graph: node types with the names of their features, relations, and what is decided on.
-        sizes: of the network.
+        sizes: of the network, whose class says what its architecture is.
         command: the exact command that trained it.
         git_hash: the source that the command ran on, see `source_revision`.
         seed: of the training run.
@@ -72,9 +92,15 @@ def write_card(path: str | Path, card: PolicyCard) -> None:
 
 
 def read_card(path: str | Path) -> PolicyCard:
-    """The card in a JSON file; InvalidFileError names the field that is not as expected."""
+    """The card in a JSON file; InvalidFileError names the field that is not as expected.
+
+    Cards that name no architecture are from when there was one.
+    """
+    content = read_json(path)
+    if isinstance(content, dict) and isinstance(content.get("sizes"), dict):
+        content["sizes"].setdefault(_ARCHITECTURE, "hetgat")
     try:
-        card = msgspec.convert(read_json(path), PolicyCard)
+        card = msgspec.convert(content, PolicyCard)
     except msgspec.ValidationError as error:
         reason, _, where = str(error).partition(" - at `$")
         field = where.strip("`.") or "card"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import msgspec
 
-from marl_sched.agents.cards import PolicyCard, Sizes
+from marl_sched.agents.cards import PolicyCard
 from marl_sched.agents.hetgat.checkpoint import load_network, save_network
 from marl_sched.agents.hetgat.network import HetGATNetwork
 from marl_sched.agents.hetgat.policy import HetGATPolicy
@@ -36,7 +36,7 @@ def save_best(network: HetGATNetwork, record: RunRecord, update: int, score: flo
         objective=config.env.objective,
         view=config.view,
         graph=network.spec,
-        sizes=Sizes(**network.sizes),
+        sizes=network.sizes,
         command=record.command,
         git_hash=record.revision,
         seed=config.seed,

@@ -11,9 +11,11 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
+from marl_sched.agents.cards import HetGATSizes
 from marl_sched.agents.hetgat.inputs import GraphInputs, read_graph
 from marl_sched.agents.hetgat.layer import HetGATLayer, LayerWeights, Merge
-from marl_sched.graph import ACTION_MASK, DECISION, STATE, GraphSpec
+from marl_sched.agents.learned.network import PolicyNetwork, explore_at_first, only_legal
+from marl_sched.graph import DECISION, STATE, GraphSpec
 
 EncoderWeights = tuple[LayerWeights, ...]
 
@@ -61,7 +63,7 @@ class HetGATEncoder(nn.Module):
         return nodes, graph
 
 
-class HetGATNetwork(nn.Module):
+class HetGATNetwork(PolicyNetwork):
     """A policy's network: logits over the decision nodes.
 
     Args:
@@ -69,29 +71,25 @@ class HetGATNetwork(nn.Module):
         width, heads, layers: sizes of the encoder; the dissertation's are 32, 4 and 3.
     """
 
+    permutable = True
+    sizes: HetGATSizes
+
     def __init__(self, spec: GraphSpec, *, width: int = 8, heads: int = 4, layers: int = 3) -> None:
         super().__init__()
         self.spec = spec
-        self.sizes = {"width": width, "heads": heads, "layers": layers}
+        self.sizes = HetGATSizes(width=width, heads=heads, layers=layers)
         self.encoder = HetGATEncoder(spec, width=width, heads=heads, layers=layers, outputs=[DECISION])
         self.readout = nn.Linear(width, 1)
-        # Nearly equal logits: an untrained policy explores all legal targets alike.
-        nn.init.normal_(self.readout.weight, std=0.01)
-        nn.init.zeros_(self.readout.bias)
+        explore_at_first(self.readout)
 
     def weights(self) -> EncoderWeights:
         """All layers' weights as they are applied (`HetGATLayer.weights`), for passes with fixed parameters."""
         return self.encoder.weights()
 
     def forward(self, observation: Mapping[str, Tensor], weights: EncoderWeights | None = None) -> Tensor:
-        """Logits (B, n_targets) from the tensors of an observation (marl_sched.graph, with batch axis).
-
-        Targets outside the action mask get the dtype's lowest finite number: their probability is exactly
-        zero, and p log p is zero where -inf would make it NaN.
-        """
+        """Logits (B, n_targets), see PolicyNetwork."""
         nodes, _ = self.encoder(observation, weights)
-        logits = self.readout(nodes[DECISION]).squeeze(-1)
-        return torch.where(observation[ACTION_MASK] != 0, logits, torch.finfo(logits.dtype).min)
+        return only_legal(self.readout(nodes[DECISION]).squeeze(-1), observation)
 
 
 class HetGATCritic(nn.Module):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from marl_sched.agents.cards import PolicyCard, Sizes, check_graph, read_card, source_revision
+from marl_sched.agents.cards import PolicyCard, check_graph, read_card, source_revision
 from marl_sched.agents.hetgat.checkpoint import load_network, save_network
 from marl_sched.agents.hetgat.network import HetGATNetwork
 from marl_sched.agents.hetgat.policy import HetGATPolicy
@@ -33,7 +33,7 @@ def card_of(network: HetGATNetwork) -> PolicyCard:
         objective="profit",
         view={"kind": "local", "reach": 1, "comm": 1, "staleness": 0},
         graph=network.spec,
-        sizes=Sizes(**network.sizes),
+        sizes=network.sizes,
         command="marl-sched train env=airme view=local seed=7",
         git_hash=source_revision(),
         seed=7,

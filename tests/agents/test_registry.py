@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from marl_sched.agents import create_scheduler, load_policy, registry, scheduler_names
-from marl_sched.agents.cards import PolicyCard, Sizes
+from marl_sched.agents.cards import PolicyCard
 from marl_sched.agents.hetgat.checkpoint import save_network
 from marl_sched.agents.hetgat.network import HetGATNetwork
 from marl_sched.agents.hetgat.policy import HetGATPolicy
@@ -29,7 +29,7 @@ def checkpoint(tmp_path):
         objective="profit",
         view={"kind": "full"},
         graph=network.spec,
-        sizes=Sizes(**network.sizes),
+        sizes=network.sizes,
         command="marl-sched train",
         git_hash="",
         seed=0,

@@ -158,16 +158,16 @@ def save_policy(tmp_path: Path) -> Callable[[int], str]:
 
     def save(seed: int) -> str:
         torch = pytest.importorskip("torch")
-        from marl_sched.agents.cards import PolicyCard, Sizes
+        from marl_sched.agents.cards import PolicyCard
         from marl_sched.agents.hetgat.checkpoint import save_network
         from marl_sched.agents.hetgat.network import HetGATNetwork
 
-        graph, sizes = WorldOptions(seed=0).simulator().graph, Sizes(width=4, heads=2, layers=2)
+        graph = WorldOptions(seed=0).simulator().graph
         with torch.random.fork_rng():
             torch.manual_seed(seed)
-            network = HetGATNetwork(graph, width=sizes.width, heads=sizes.heads, layers=sizes.layers)
+            network = HetGATNetwork(graph, width=4, heads=2, layers=2)
         card = PolicyCard(
-            domain="airme", objective="profit", view={"kind": "local"}, graph=graph, sizes=sizes,
+            domain="airme", objective="profit", view={"kind": "local"}, graph=graph, sizes=network.sizes,
             command="none", git_hash="none", seed=seed, scores={},
         )  # fmt: skip
         path = tmp_path / f"policy-{seed}.safetensors"

@@ -25,7 +25,7 @@ ALLOWED = {
 FRONT_DOORS = {"marl_sched.airme_v0": "envs", "marl_sched.murse_v0": "envs"}
 
 # What may need torch: the TorchRL face, learned policies and training. Comparing rules does not.
-NEEDS_TORCH = ("marl_sched.envs.torchrl", "marl_sched.agents.hetgat", "marl_sched.train.")
+NEEDS_TORCH = ("marl_sched.envs.torchrl", "marl_sched.agents.hetgat", "marl_sched.agents.learned", "marl_sched.train.")
 DOES_NOT = ("marl_sched.train.evaluate", "marl_sched.train.compare", "marl_sched.train.plots")
 
 BLOCKER = """
