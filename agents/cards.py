@@ -112,6 +112,9 @@ def read_card(path: str | Path) -> PolicyCard:
         _check_relation(path, f"graph.relations[{i}]", relation, [node.name for node in card.graph.nodes])
     keys = [relation.key for relation in card.graph.relations]
     _require_distinct(path, "graph.relations", keys)
+    names = sorted(node.name for node in card.graph.nodes)
+    if isinstance(card.sizes, DeepRMSizes) and sorted(card.sizes.slots) != names:
+        raise InvalidFileError(path, "sizes.slots", f"a number for each of {names}", sorted(card.sizes.slots))
     return card
 
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import msgspec
 
 from marl_sched.agents.cards import PolicyCard
-from marl_sched.agents.hetgat.checkpoint import load_network, save_network
 from marl_sched.agents.hetgat.network import HetGATNetwork
 from marl_sched.agents.hetgat.policy import HetGATPolicy
+from marl_sched.agents.learned.checkpoint import load_network, save_network
 from marl_sched.domain import get_domain
 from marl_sched.train.config import GaeConfig, RunRecord
 from marl_sched.train.evaluate import Settings, evaluate_scheduler

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from marl_sched.agents.base import ObservationScheduler
 from marl_sched.agents.cards import PolicyCard, check_graph
-from marl_sched.agents.hetgat.checkpoint import load_network
-from marl_sched.agents.hetgat.network import HetGATNetwork
+from marl_sched.agents.learned.checkpoint import load_network
+from marl_sched.agents.learned.network import PolicyNetwork
 from marl_sched.errors import InvalidOptionError
 from marl_sched.graph import STATE, TIME, VISIBLE_SHARE, GraphSpec
 from marl_sched.simulation import TurnSimulator
@@ -37,7 +37,7 @@ class HetGATPolicy(ObservationScheduler):
     """
 
     def __init__(
-        self, network: HetGATNetwork, *, name: str = "hetgat", mode: Mode = "greedy", card: PolicyCard | None = None
+        self, network: PolicyNetwork, *, name: str = "hetgat", mode: Mode = "greedy", card: PolicyCard | None = None
     ) -> None:
         if mode not in get_args(Mode):
             raise InvalidOptionError(
@@ -56,7 +56,7 @@ class HetGATPolicy(ObservationScheduler):
 
     @classmethod
     def load(cls, path: str | Path, *, mode: Mode = "greedy", graph: GraphSpec | None = None) -> HetGATPolicy:
-        """A policy from its files (marl_sched.agents.hetgat.checkpoint); its name is the file's.
+        """A policy from its files (marl_sched.agents.learned.checkpoint); its name is the file's.
 
         Raises InvalidFileError for damaged files, or if the policy was trained on another metagraph than `graph`.
         """

@@ -12,9 +12,9 @@ import pytest
 import torch
 
 from marl_sched.agents.cards import PolicyCard, check_graph, read_card, source_revision
-from marl_sched.agents.hetgat.checkpoint import load_network, save_network
 from marl_sched.agents.hetgat.network import HetGATNetwork
 from marl_sched.agents.hetgat.policy import HetGATPolicy
+from marl_sched.agents.learned.checkpoint import load_network, save_network
 from marl_sched.agents.registry import create_scheduler
 from marl_sched.domain import domain_names, get_domain
 from marl_sched.errors import InvalidFileError
@@ -58,6 +58,14 @@ def test_a_checkpoint_comes_back_as_it_was(network, saved, sizes, observe):
     policy = HetGATPolicy.load(saved, graph=network.spec)
     assert policy.name == "mine"
     assert policy.choose({name: v.numpy() for name, v in observation.items()}, np.zeros(3)).shape == (3,)
+
+
+def test_a_card_from_before_there_were_other_architectures_is_hetgats(network, saved):
+    card = saved.with_suffix(".json")
+    content = json.loads(card.read_text())
+    assert content["sizes"].pop("architecture") == "hetgat"
+    card.write_text(json.dumps(content))
+    assert read_card(card).sizes == network.sizes
 
 
 def test_saving_leaves_two_files_and_no_temporary_one(saved):

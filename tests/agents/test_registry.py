@@ -11,9 +11,9 @@ import torch
 
 from marl_sched.agents import create_scheduler, load_policy, registry, scheduler_names
 from marl_sched.agents.cards import PolicyCard
-from marl_sched.agents.hetgat.checkpoint import save_network
 from marl_sched.agents.hetgat.network import HetGATNetwork
 from marl_sched.agents.hetgat.policy import HetGATPolicy
+from marl_sched.agents.learned.checkpoint import save_network
 from marl_sched.envs.airme.graph import graph_spec
 from marl_sched.errors import InvalidFileError, InvalidOptionError, UnknownNameError
 

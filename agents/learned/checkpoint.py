@@ -12,12 +12,13 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from marl_sched.agents.cards import PolicyCard, read_card, write_card
-from marl_sched.agents.hetgat.network import HetGATNetwork
+from marl_sched.agents.learned.architectures import new_network
+from marl_sched.agents.learned.network import PolicyNetwork
 from marl_sched.errors import InvalidFileError
 from marl_sched.files import replacing
 
 
-def save_network(path: str | Path, network: HetGATNetwork, card: PolicyCard) -> None:
+def save_network(path: str | Path, network: PolicyNetwork, card: PolicyCard) -> None:
     """Write `path` (NAME.safetensors) and the card beside it, each whole or not at all.
 
     The card is written last and holds the weights' hash, so weights and a card that do not belong together,
@@ -31,7 +32,7 @@ def save_network(path: str | Path, network: HetGATNetwork, card: PolicyCard) -> 
     write_card(path.with_suffix(".json"), msgspec.structs.replace(card, weights_sha256=_sha256(data)))
 
 
-def load_network(path: str | Path) -> tuple[HetGATNetwork, PolicyCard]:
+def load_network(path: str | Path) -> tuple[PolicyNetwork, PolicyCard]:
     """The network and the card of a policy, from the path of either file.
 
     Raises InvalidFileError for a file that is missing, truncated, malformed or not the other's.
@@ -39,7 +40,7 @@ def load_network(path: str | Path) -> tuple[HetGATNetwork, PolicyCard]:
     weights_path, card_path = Path(path).with_suffix(".safetensors"), Path(path).with_suffix(".json")
     card = read_card(card_path)
     with torch.device("meta"):  # shapes without memory, until they are known to be those of the weights
-        network = HetGATNetwork(card.graph, **msgspec.structs.asdict(card.sizes))
+        network = new_network(card.graph, card.sizes)
     weights = _read_weights(weights_path, card)
     expected = network.state_dict()
     for name in sorted(expected.keys() | weights.keys()):
