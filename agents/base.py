@@ -69,6 +69,17 @@ class ObservationScheduler(Scheduler):
         return int(self.choose(batched, np.array([uniform]))[0])
 
 
+class AdvantageScheduler(ObservationScheduler):
+    """A scheduler that can tell how good every choice is, so that a policy can learn from it by imitation."""
+
+    @abstractmethod
+    def advantages(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
+        """What each target is worth more than doing nothing, float64 (B, n_targets).
+
+        0 for target 0, -inf for targets that are not legal or not worth considering.
+        """
+
+
 def best_target(score: np.ndarray, eligible: np.ndarray) -> np.ndarray:
     """The eligible target with the highest score, ties to the lowest index, 0 where none is eligible.
 

@@ -83,12 +83,7 @@ def load_policy(
     Raises UnknownNameError for a name that does not ship, InvalidFileError for damaged files, MarlSchedError
     without PyTorch.
     """
-    if _is_path(name_or_path):
-        path = Path(name_or_path)
-    elif str(name_or_path) in shipped_policies():
-        path = SHIPPED / f"{name_or_path}.safetensors"
-    else:
-        raise UnknownNameError("policy", str(name_or_path), shipped_policies())
+    path = policy_path(name_or_path)
     try:
         from marl_sched.agents.hetgat.policy import HetGATPolicy
     except ModuleNotFoundError as error:
@@ -98,6 +93,18 @@ def load_policy(
             f"policy {name_or_path}: expected {error.name} to be installed: pip install 'marl-sched[train]'"
         ) from error
     return HetGATPolicy.load(path, mode=mode, graph=graph)
+
+
+def policy_path(name_or_path: str | Path) -> Path:
+    """Where a policy's weights or card are: a path as it is, a shipped name in its folder.
+
+    Raises UnknownNameError for a name that does not ship.
+    """
+    if _is_path(name_or_path):
+        return Path(name_or_path)
+    if str(name_or_path) in shipped_policies():
+        return SHIPPED / f"{name_or_path}.safetensors"
+    raise UnknownNameError("policy", str(name_or_path), shipped_policies())
 
 
 def _is_path(name_or_path: str | Path) -> bool:

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from marl_sched.errors import InvalidFileError
 from marl_sched.files import read_json, replacing, write_json
-from marl_sched.train.ppo import Ppo
+from marl_sched.train.learner import Learner
 
 NAME = "checkpoint.json"
 _COLLECTOR = "collector."
@@ -46,38 +46,39 @@ class Counters:
 
 
 class Numbers(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What `checkpoint.json` holds; `tensors` is the name of the other file, `estimator` the estimator's state."""
+    """What `checkpoint.json` holds; `tensors` is the name of the other file, `learner` the learner's state."""
 
     tensors: str
     counters: Counters
-    estimator: dict[str, float | None]
-    schema: Literal[1] = 1
+    learner: dict[str, float | None]
+    schema: Literal[2] = 2
 
 
 def save_checkpoint(
     directory: Path,
     counters: Counters,
-    ppo: Ppo,
-    estimator: dict[str, float | None],
+    learner: Learner,
     collector: Mapping[str, np.ndarray],
 ) -> None:
-    """Write networks, optimizer, the states of estimator and collector, and the counters."""
-    if not ppo.optimizer.state:  # before the first update
-        _prepare(ppo)
+    """Write networks, optimizer, the states of learner and collector, and the counters."""
+    if not learner.optimizer.state:  # before the first update
+        _prepare(learner)
     tensors = {f"{_COLLECTOR}{name}": torch.from_numpy(array) for name, array in collector.items()}
-    tensors |= _learned(ppo)
+    tensors |= _learned(learner)
     name = f"checkpoint-{counters.update:06d}.safetensors"
     with replacing(directory / name) as temporary:
         save_file({key: tensor.contiguous() for key, tensor in tensors.items()}, temporary)
-    numbers = Numbers(tensors=name, counters=counters, estimator=estimator)
+    numbers = Numbers(tensors=name, counters=counters, learner=learner.state())
     write_json(directory / NAME, msgspec.to_builtins(numbers))
     for old in directory.glob("checkpoint-*.safetensors"):
         if old.name != name:
             old.unlink()
 
 
-def load_checkpoint(directory: Path, ppo: Ppo, expected: Collection[str]) -> tuple[Numbers, dict[str, np.ndarray]]:
-    """Put networks and optimizer back; the numbers and the collector's state, with the `expected` names.
+def load_checkpoint(
+    directory: Path, learner: Learner, expected: Collection[str]
+) -> tuple[Counters, dict[str, np.ndarray]]:
+    """Put the learner back; the counters and the collector's state, with the `expected` names.
 
     Raises InvalidFileError for a file that is missing, damaged or of another network.
     """
@@ -93,31 +94,32 @@ def load_checkpoint(directory: Path, ppo: Ppo, expected: Collection[str]) -> tup
     for name in expected:
         if _COLLECTOR + name not in saved:
             raise InvalidFileError(path, _COLLECTOR + name, "a tensor of that name")
-    _prepare(ppo)
+    _prepare(learner)
     with torch.no_grad():
-        for name, tensor in _learned(ppo).items():
+        for name, tensor in _learned(learner).items():
             if name not in saved or saved[name].shape != tensor.shape:
                 raise InvalidFileError(path, name, f"a tensor of shape {tuple(tensor.shape)}")
             tensor.copy_(saved[name])
-    return numbers, {name: saved[_COLLECTOR + name].numpy() for name in expected}
+    learner.restore(numbers.learner)
+    return numbers.counters, {name: saved[_COLLECTOR + name].numpy() for name in expected}
 
 
-def _learned(ppo: Ppo) -> dict[str, Tensor]:
+def _learned(learner: Learner) -> dict[str, Tensor]:
     """Every tensor that learning changes, by name; the tensors themselves, not copies."""
     tensors: dict[str, Tensor] = {}
-    for module_name, module in ppo.modules.items():
+    for module_name, module in learner.modules.items():
         for name, parameter in module.named_parameters():
             tensors[f"{module_name}.{name}"] = parameter.data
-            for key, value in ppo.optimizer.state.get(parameter, {}).items():
+            for key, value in learner.optimizer.state.get(parameter, {}).items():
                 tensors[f"optimizer.{key}.{module_name}.{name}"] = value
     return tensors
 
 
-def _prepare(ppo: Ppo) -> None:
+def _prepare(learner: Learner) -> None:
     """Give a fresh Adam the state that it otherwise makes in its first step."""
-    for group in ppo.optimizer.param_groups:
+    for group in learner.optimizer.param_groups:
         for parameter in group["params"]:
-            ppo.optimizer.state[parameter] = {
+            learner.optimizer.state[parameter] = {
                 "step": torch.zeros((), dtype=torch.float32),
                 "exp_avg": torch.zeros_like(parameter),
                 "exp_avg_sq": torch.zeros_like(parameter),

@@ -50,12 +50,29 @@ class EnvConfig(_Config, frozen=True, kw_only=True):
     options: dict[str, Any]
 
 
-class PolicyConfig(_Config, frozen=True, kw_only=True):
+class HetGATConfig(_Config, frozen=True, kw_only=True, tag_field="name", tag="hetgat"):
     """Sizes of a HetGAT network: features per head, heads per layer, layers."""
 
     width: Width
     heads: Heads
     layers: Layers
+
+
+class DecimaConfig(_Config, frozen=True, kw_only=True, tag_field="name", tag="decima"):
+    """Sizes of Decima's three networks: features of a layer, layers of each."""
+
+    hidden: Width
+    layers: Layers
+
+
+class DeepRMConfig(_Config, frozen=True, kw_only=True, tag_field="name", tag="deeprm"):
+    """Sizes of a DeepRM network: features of a layer, layers. The largest of the run's scales sets its slots."""
+
+    hidden: Width
+    layers: Layers
+
+
+PolicyConfig = HetGATConfig | DecimaConfig | DeepRMConfig
 
 
 class PpoConfig(_Config, frozen=True, kw_only=True):
@@ -80,7 +97,7 @@ class GaeConfig(_Config, frozen=True, kw_only=True, tag_field="name", tag="gae")
     discount: Share
     trace: Share
     centred: bool
-    critic: PolicyConfig
+    critic: HetGATConfig
     ppo: PpoConfig
 
 
@@ -91,6 +108,25 @@ class StepBaselineConfig(_Config, frozen=True, kw_only=True, tag_field="name", t
     episodes: Annotated[int, Meta(ge=2)]
     discount: Share
     ppo: PpoConfig
+
+
+class ImitationConfig(_Config, frozen=True, kw_only=True, tag_field="name", tag="imitation"):
+    """Choices scored by a scheduler that knows more; temperature and learning rate change linearly.
+
+    Rows play on from update to update, `turns` turns each, with the policy that learns.
+    """
+
+    instances: Count
+    turns: Count
+    teacher: str
+    epochs: Count
+    minibatch: Count
+    learning_rate: Positive
+    final_learning_rate: NonNegative
+    temperature: Positive
+    final_temperature: Positive
+    max_gradient: Positive
+    keep_least: Annotated[float, Meta(gt=0, le=1)]
 
 
 class CurriculumConfig(_Config, frozen=True, kw_only=True):
@@ -113,14 +149,15 @@ class ValidationConfig(_Config, frozen=True, kw_only=True):
 
 
 class TrainConfig(_Config, frozen=True, kw_only=True):
-    """A whole run; `configs/train.yaml`."""
+    """A whole run; `configs/train.yaml`. `start_from`: a policy, by name or path, to go on from."""
 
     env: EnvConfig
     view: dict[str, Any]
     policy: PolicyConfig
-    algorithm: GaeConfig | StepBaselineConfig
+    algorithm: GaeConfig | StepBaselineConfig | ImitationConfig
     curriculum: CurriculumConfig
     validation: ValidationConfig
+    start_from: str | None = None
     seed: Seed
     updates: Count
     threads: Count
@@ -171,9 +208,16 @@ def load_config(overrides: Sequence[str]) -> TrainConfig:
 
 
 def load_record(path: Path) -> RunRecord:
-    """The record of a run, from its `config.json`; InvalidFileError if it does not hold one."""
+    """The record of a run, from its `config.json`; InvalidFileError if it does not hold one.
+
+    A policy without a name is from when there was one architecture.
+    """
+    content = read_json(path)
+    match content:
+        case {"config": {"policy": dict() as policy}}:
+            policy.setdefault("name", "hetgat")
     try:
-        record = msgspec.convert(read_json(path), RunRecord)
+        record = msgspec.convert(content, RunRecord)
     except msgspec.ValidationError as error:
         raise InvalidFileError(path, "", f"the record of a training run: {error}") from error
     _checked(record.config)

@@ -7,22 +7,22 @@ from pathlib import Path
 
 import msgspec
 
-from marl_sched.agents.cards import PolicyCard
-from marl_sched.agents.hetgat.network import HetGATNetwork
+from marl_sched.agents.cards import PolicyCard, read_card
 from marl_sched.agents.hetgat.policy import HetGATPolicy
 from marl_sched.agents.learned.checkpoint import load_network, save_network
+from marl_sched.agents.learned.network import PolicyNetwork
+from marl_sched.agents.registry import create_scheduler, policy_path
 from marl_sched.domain import get_domain
-from marl_sched.train.config import GaeConfig, RunRecord
+from marl_sched.train.config import GaeConfig, ImitationConfig, RunRecord, TrainConfig
 from marl_sched.train.evaluate import Settings, evaluate_scheduler
 
 BEST = "policy.safetensors"
 
 
-def save_best(network: HetGATNetwork, record: RunRecord, update: int, score: float, directory: Path) -> None:
+def save_best(network: PolicyNetwork, record: RunRecord, update: int, score: float, directory: Path) -> None:
     """Write `policy.safetensors` and its card into the run's directory; `score` is M1 on the validation set."""
     config = record.config
     validation = config.validation
-    central = isinstance(config.algorithm, GaeConfig) and config.view["kind"] != "full"
     measured = {
         "scale": config.env.scales[0],
         "M1": score,
@@ -41,9 +41,27 @@ def save_best(network: HetGATNetwork, record: RunRecord, update: int, score: flo
         git_hash=record.revision,
         seed=config.seed,
         scores={"validation": measured},
-        training_knowledge="a critic on the full graph" if central else "",
+        training_knowledge=knowledge(config),
     )
     save_network(directory / BEST, network, card)
+
+
+def knowledge(config: TrainConfig) -> str:
+    """What a run uses beyond the policy's view, the runs that it goes on from included."""
+    used = []
+    if config.start_from is not None:
+        first = read_card(policy_path(config.start_from).with_suffix(".json"))
+        if first.training_knowledge:
+            used.append(first.training_knowledge)
+    if isinstance(config.algorithm, ImitationConfig):
+        teacher = create_scheduler(config.algorithm.teacher, config.env.name)
+        used.append(f"imitation of {teacher.name}" + (f" ({teacher.needs})" if teacher.needs else ""))
+    local = config.view["kind"] != "full"
+    if isinstance(config.algorithm, GaeConfig) and local:
+        used.append("a critic on the full graph")
+    if isinstance(config.algorithm, ImitationConfig) and local:
+        used.append("the full graph for the teacher")
+    return ", ".join(dict.fromkeys(used))
 
 
 def export_policy(

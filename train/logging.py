@@ -14,8 +14,8 @@ from torch.utils.tensorboard import SummaryWriter
 from marl_sched.files import replacing
 
 COLUMNS = (
-    "update", "seconds", "hours", "decisions", "reward_rate", "validation", "best", "policy_loss", "value_loss",
-    "explained_variance", "entropy", "kl", "clipped", "gradient", "length",
+    "update", "seconds", "hours", "decisions", "reward_rate", "validation", "best", "policy_loss", "regret",
+    "value_loss", "explained_variance", "entropy", "kl", "clipped", "gradient", "length",
 )  # fmt: skip
 
 

@@ -6,18 +6,37 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import torch
 
-from marl_sched.agents.hetgat.network import HetGATCritic, HetGATNetwork
+from marl_sched.agents.base import AdvantageScheduler
+from marl_sched.agents.cards import DecimaSizes, DeepRMSizes, HetGATSizes, Sizes, check_graph
+from marl_sched.agents.hetgat.network import HetGATCritic
+from marl_sched.agents.learned.architectures import new_network
+from marl_sched.agents.learned.checkpoint import load_network
+from marl_sched.agents.learned.network import PolicyNetwork
+from marl_sched.agents.registry import create_scheduler, policy_path
 from marl_sched.domain import get_domain
 from marl_sched.envs.torchrl_env import SchedulingTorchRL
-from marl_sched.graph import GraphSpec
+from marl_sched.errors import InvalidOptionError
 from marl_sched.train.checkpoint import Counters, load_checkpoint, save_checkpoint
 from marl_sched.train.collect import Collector, EpisodeCollector, InstanceSource, SegmentCollector
-from marl_sched.train.config import GaeConfig, RunRecord, StepBaselineConfig, TrainConfig
+from marl_sched.train.config import (
+    DecimaConfig,
+    DeepRMConfig,
+    GaeConfig,
+    HetGATConfig,
+    ImitationConfig,
+    PolicyConfig,
+    RunRecord,
+    StepBaselineConfig,
+    TrainConfig,
+)
 from marl_sched.train.curriculum import EpisodeLength
-from marl_sched.train.estimators import CriticEstimator, Estimator, StepBaseline
+from marl_sched.train.estimators import CriticEstimator, StepBaseline
 from marl_sched.train.export import save_best
+from marl_sched.train.imitation import Imitation
+from marl_sched.train.learner import Learner, PolicyGradient
 from marl_sched.train.ppo import Ppo
 from marl_sched.train.validation import Validation
 
@@ -28,25 +47,19 @@ class Parts:
 
     record: RunRecord
     collector: Collector
-    estimator: Estimator
-    ppo: Ppo
+    learner: Learner
     length: EpisodeLength
     validation: Validation
-
-    @property
-    def graph(self) -> GraphSpec:
-        """The metagraph of what is learned on."""
-        return self.collector.env.simulator.graph
 
     def validate(self, counters: Counters, directory: Path) -> dict[str, float]:
         """Play the validation instances if it is time to, and keep the policy if it is the best so far."""
         config = self.record.config
         if counters.update % config.validation.every and counters.update != config.updates:
             return {}
-        score = self.validation(self.ppo.policy)
+        score = self.validation(self.learner.policy)
         if counters.best is None or score > counters.best:
             counters.best = score
-            save_best(self.ppo.policy, self.record, counters.update, score, directory)
+            save_best(self.learner.policy, self.record, counters.update, score, directory)
         return {"validation": score, "best": counters.best}
 
     def save(self, counters: Counters, directory: Path) -> None:
@@ -54,48 +67,94 @@ class Parts:
         config = self.record.config
         if counters.update % config.save_every and counters.update != config.updates:
             return
-        save_checkpoint(directory, counters, self.ppo, self.estimator.state(), self.collector.state())
+        save_checkpoint(directory, counters, self.learner, self.collector.state())
 
     def restore(self, directory: Path) -> Counters:
         """Put everything back as the last checkpoint has it."""
-        numbers, collector = load_checkpoint(directory, self.ppo, list(self.collector.state()))
-        self.estimator.restore(numbers.estimator)
+        counters, collector = load_checkpoint(directory, self.learner, list(self.collector.state()))
         self.collector.restore(collector)
-        return numbers.counters
+        return counters
 
 
 def build(record: RunRecord) -> Parts:
-    """The parts that a run's configuration names, with freshly drawn networks."""
-    config, algorithm = record.config, record.config.algorithm
+    """The parts that a run's configuration names, with freshly drawn networks or those that it starts from."""
+    config = record.config
     length = EpisodeLength(**msgspec.structs.asdict(config.curriculum), seed=config.seed)
     with torch.random.fork_rng():
         torch.manual_seed(config.seed)
-        if isinstance(algorithm, GaeConfig):
-            collector, estimator, critic = _with_critic(config, algorithm, length)
-        else:
-            collector, estimator, critic = _with_step_baseline(config, algorithm, length)
-        policy = HetGATNetwork(collector.env.simulator.graph, **msgspec.structs.asdict(config.policy))
-    ppo = Ppo(policy, critic, algorithm.ppo)
-    return Parts(record, collector, estimator, ppo, length, Validation(config))
+        collector, learner = _with_algorithm(config, length)
+    return Parts(record, collector, learner, length, Validation(config))
 
 
-_Chosen = tuple[Collector, Estimator, HetGATCritic | None]
+def _with_algorithm(config: TrainConfig, length: EpisodeLength) -> tuple[Collector, Learner]:
+    match config.algorithm:
+        case GaeConfig() as algorithm:
+            return _with_critic(config, algorithm, length)
+        case StepBaselineConfig() as algorithm:
+            return _with_step_baseline(config, algorithm, length)
+        case ImitationConfig() as algorithm:
+            return _with_teacher(config, algorithm, length)
 
 
-def _with_critic(config: TrainConfig, algorithm: GaeConfig, length: EpisodeLength) -> _Chosen:
+def _with_critic(config: TrainConfig, algorithm: GaeConfig, length: EpisodeLength) -> tuple[Collector, Learner]:
     env = _environment(config, length, rows=algorithm.instances, episodes=1)
-    central = config.view["kind"] != "full"
-    collector = SegmentCollector(env, turns=algorithm.turns, length=length(0), central=central)
     critic = HetGATCritic(env.simulator.graph, **msgspec.structs.asdict(algorithm.critic))
     estimator = CriticEstimator(critic, discount=algorithm.discount, trace=algorithm.trace, centred=algorithm.centred)
-    return collector, estimator, critic
+    learner = PolicyGradient(Ppo(_policy(config, env), critic, algorithm.ppo), estimator)
+    return _segments(config, env, algorithm.turns, length), learner
 
 
-def _with_step_baseline(config: TrainConfig, algorithm: StepBaselineConfig, length: EpisodeLength) -> _Chosen:
+def _with_step_baseline(
+    config: TrainConfig, algorithm: StepBaselineConfig, length: EpisodeLength
+) -> tuple[Collector, Learner]:
     rows = algorithm.instances * algorithm.episodes
     env = _environment(config, length, rows=rows, episodes=algorithm.episodes)
     estimator = StepBaseline(discount=algorithm.discount, episodes=algorithm.episodes)
-    return EpisodeCollector(env, central=False), estimator, None
+    learner = PolicyGradient(Ppo(_policy(config, env), None, algorithm.ppo), estimator)
+    return EpisodeCollector(env, central=False), learner
+
+
+def _with_teacher(config: TrainConfig, algorithm: ImitationConfig, length: EpisodeLength) -> tuple[Collector, Learner]:
+    env = _environment(config, length, rows=algorithm.instances, episodes=1)
+    teacher = create_scheduler(algorithm.teacher, config.env.name)
+    if not isinstance(teacher, AdvantageScheduler):
+        raise InvalidOptionError(
+            f"train: algorithm.teacher: expected a scheduler that can tell how good every choice is, "
+            f"got {algorithm.teacher}"
+        )
+    teacher.start(env.simulator, np.ones(env.simulator.batch, np.bool_))
+    return _segments(config, env, algorithm.turns, length), Imitation(_policy(config, env), teacher, algorithm)
+
+
+def _segments(config: TrainConfig, env: SchedulingTorchRL, turns: int, length: EpisodeLength) -> SegmentCollector:
+    return SegmentCollector(env, turns=turns, length=length(0), central=config.view["kind"] != "full")
+
+
+def _policy(config: TrainConfig, env: SchedulingTorchRL) -> PolicyNetwork:
+    """A freshly drawn network, or a copy of the one that the run starts from, which must have the same sizes."""
+    network = new_network(env.simulator.graph, _sizes(config.policy, env))
+    if config.start_from is not None:
+        start = policy_path(config.start_from)
+        first, card = load_network(start)
+        check_graph(start, card, network.spec)
+        if first.sizes != network.sizes:
+            raise InvalidOptionError(f"train: start_from: expected a network of {network.sizes}, got {first.sizes}")
+        network.load_state_dict(first.state_dict())
+    return network
+
+
+def _sizes(policy: PolicyConfig, env: SchedulingTorchRL) -> Sizes:
+    """A network's sizes: those of the configuration and, for one that is bound to them, the environment's slots."""
+    given = msgspec.structs.asdict(policy)
+    match policy:
+        case HetGATConfig():
+            return HetGATSizes(**given)
+        case DecimaConfig():
+            return DecimaSizes(**given)
+        case DeepRMConfig():
+            simulator = env.simulator
+            slots = {node.name: simulator.arrays[node.name].shape[0] for node in simulator.graph.nodes}
+            return DeepRMSizes(**given, slots=slots)
 
 
 def _environment(config: TrainConfig, length: EpisodeLength, *, rows: int, episodes: int) -> SchedulingTorchRL:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,9 +10,10 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from marl_sched.agents.hetgat.network import HetGATCritic, HetGATNetwork
+from marl_sched.agents.hetgat.network import HetGATCritic
 from marl_sched.agents.hetgat.policy import inverse_distribution
-from marl_sched.graph import GraphSpec
+from marl_sched.agents.learned.network import PolicyNetwork
+from marl_sched.graph import ACTION_MASK
 from marl_sched.train.advantages import normalised
 from marl_sched.train.collect import Rollout
 from marl_sched.train.compaction import compacted
@@ -37,7 +38,7 @@ class UpdateReport:
 class Sampler:
     """Samples a policy by inverse distribution, as an `Act` for collectors; see marl_sched.train.collect."""
 
-    def __init__(self, network: HetGATNetwork) -> None:
+    def __init__(self, network: PolicyNetwork) -> None:
         self._network = network
         with torch.inference_mode():
             self._weights = network.weights()
@@ -45,43 +46,64 @@ class Sampler:
     @torch.inference_mode()
     def __call__(self, observation: dict[str, Tensor], uniform: np.ndarray) -> tuple[Tensor, Tensor]:
         """Targets int64 (B,) and log-probabilities float32 (B,)."""
-        visible, names = compacted(self._network.spec, observation)
+        visible, names = _as_read(self._network, observation)
         log_probs = self._network(visible, self._weights).log_softmax(-1)
         picked = torch.from_numpy(inverse_distribution(log_probs.numpy(), uniform))[:, None]
         return names.gather(1, picked).squeeze(1), log_probs.gather(1, picked).squeeze(1)
 
 
-def samples_of(
-    spec: GraphSpec, rollout: Rollout, estimate: Estimate, keep_least: float, rng: np.random.Generator
-) -> TensorDict:
-    """Valid turns of a rollout as a flat TensorDict of compacted graphs, with normalised advantages and weights.
+def thinned(
+    policy: PolicyNetwork, rollout: Rollout, keep_least: float, rng: np.random.Generator
+) -> tuple[TensorDict, Tensor, Tensor]:
+    """Valid turns of a rollout as a flat TensorDict of compacted graphs, with weights.
 
     Turns that are not valid are left behind here, whatever they hold. Of the others a turn is kept with
     probability q = max(1 - p, keep_least), p being the probability of what was chosen, and weighs 1 / q:
     where a policy is nearly certain (a crew that waits, hour after hour) there is little to learn, and
     the weights keep every sum's expectation. `keep_least` 1 keeps all.
+
+    Returns the samples, the target that each decision node of theirs stands for, int64 (N, n_kept), and
+    the row of the flattened rollout (T B) that each comes from, int64 (N,).
     """
     valid = rollout.valid[:-1]
     certainty = torch.where(valid, rollout.log_probs, 0.0).exp()
     keep = (1 - certainty).clamp(keep_least, 1.0)
-    kept = (valid & (torch.from_numpy(rng.random(valid.shape)) < keep)).flatten().nonzero().squeeze(1)
+    rows = (valid & (torch.from_numpy(rng.random(valid.shape)) < keep)).flatten().nonzero().squeeze(1)
+    observation, names = _as_read(policy, _picked(rollout.observation, rows))
+    data = {"observation": observation, "weight": (1 / keep).flatten()[rows]}
+    return TensorDict(data, batch_size=[len(rows)]), names, rows
+
+
+def samples_of(
+    policy: PolicyNetwork, rollout: Rollout, estimate: Estimate, keep_least: float, rng: np.random.Generator
+) -> TensorDict:
+    """Turns to learn from (`thinned`), with what was chosen, normalised advantages and value targets."""
+    samples, names, rows = thinned(policy, rollout, keep_least, rng)
 
     def pick(values: Tensor) -> Tensor:
-        return values[: valid.shape[0]].flatten(0, 1)[kept]
+        return values.flatten(0, 1)[rows]
 
-    observation, names = compacted(spec, {name: pick(values) for name, values in rollout.observation.items()})
-    data: dict[str, object] = {
-        "observation": observation,
-        "target": (names == pick(rollout.targets)[:, None]).int().argmax(1),
-        "log_prob": pick(rollout.log_probs),
-        "advantage": pick(normalised(estimate.advantages, valid)).float(),
-        "weight": pick(1 / keep),
-    }
+    samples["target"] = (names == pick(rollout.targets)[:, None]).int().argmax(1)
+    samples["log_prob"] = pick(rollout.log_probs)
+    samples["advantage"] = pick(normalised(estimate.advantages, rollout.valid[:-1])).float()
     if estimate.value_targets is not None:
-        data["value_target"] = pick(estimate.value_targets).float()
+        samples["value_target"] = pick(estimate.value_targets).float()
         if rollout.central is not rollout.observation:
-            data["central"], _ = compacted(spec, {name: pick(values) for name, values in rollout.central.items()})
-    return TensorDict(data, batch_size=[len(kept)])
+            samples["central"], _ = compacted(policy.spec, _picked(rollout.central, rows))
+    return samples
+
+
+def _picked(columns: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
+    """Rows, int64 (N,), of columns (T + 1, B, ...) laid out flat."""
+    return {name: values.flatten(0, 1)[rows] for name, values in columns.items()}
+
+
+def _as_read(network: PolicyNetwork, observation: Mapping[str, Tensor]) -> tuple[Mapping[str, Tensor], Tensor]:
+    """Observations (N, ...) as small as the network can read them, and the targets' old names (see `compacted`)."""
+    if network.permutable:
+        return compacted(network.spec, observation)
+    targets = observation[ACTION_MASK].shape
+    return observation, torch.arange(targets[1]).expand(targets)
 
 
 def policy_loss(
@@ -106,7 +128,7 @@ class Ppo:
         config: see PpoConfig.
     """
 
-    def __init__(self, policy: HetGATNetwork, critic: HetGATCritic | None, config: PpoConfig) -> None:
+    def __init__(self, policy: PolicyNetwork, critic: HetGATCritic | None, config: PpoConfig) -> None:
         self.policy, self.critic, self.config = policy, critic, config
         self.modules: dict[str, nn.Module] = {"policy": policy} | ({"critic": critic} if critic is not None else {})
         self.optimizer = torch.optim.Adam(
@@ -116,11 +138,11 @@ class Ppo:
     def update(self, samples: TensorDict, progress: float, rng: np.random.Generator) -> UpdateReport:
         """Several epochs of minibatches; `progress` in [0, 1] places learning rate and entropy bonus."""
         config = self.config
-        entropy_weight = _between(config.entropy, config.final_entropy, progress)
+        entropy_weight = between(config.entropy, config.final_entropy, progress)
         for group in self.optimizer.param_groups:
-            group["lr"] = _between(config.learning_rate, config.final_learning_rate, progress)
+            group["lr"] = between(config.learning_rate, config.final_learning_rate, progress)
         reports = []
-        for indices in _minibatches(samples.shape[0], config.minibatch, config.epochs, rng):
+        for indices in minibatches(samples.shape[0], config.minibatch, config.epochs, rng):
             reports.append(self._step(samples[indices], entropy_weight))
         return UpdateReport(*np.mean(reports, axis=0).tolist())
 
@@ -148,11 +170,12 @@ class Ppo:
         return tuple(value.item() for value in (loss, value_loss, entropy, kl, clipped, norms[0]))
 
 
-def _between(start: float, end: float, progress: float) -> float:
+def between(start: float, end: float, progress: float) -> float:
+    """What changes linearly from start to end, at `progress` in [0, 1]."""
     return start + (end - start) * progress
 
 
-def _minibatches(count: int, size: int, epochs: int, rng: np.random.Generator) -> Iterator[Tensor]:
+def minibatches(count: int, size: int, epochs: int, rng: np.random.Generator) -> Iterator[Tensor]:
     """Index tensors of at most about `size` samples each; every epoch visits every sample once."""
     parts = max(1, round(count / size))
     for _ in range(epochs):

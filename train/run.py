@@ -1,4 +1,4 @@
-"""A training run from its configuration to a policy: collect, estimate advantages, update, evaluate, log, save."""
+"""A training run from its configuration to a policy: collect, learn, evaluate, log, save."""
 
 from __future__ import annotations
 
@@ -17,10 +17,9 @@ from marl_sched.files import write_json
 from marl_sched.train.checkpoint import Counters
 from marl_sched.train.collect import Rollout
 from marl_sched.train.config import RunRecord, load_config, load_record
-from marl_sched.train.estimators import Estimate
 from marl_sched.train.logging import RunLog
 from marl_sched.train.parts import Parts, build
-from marl_sched.train.ppo import Sampler, UpdateReport, samples_of
+from marl_sched.train.ppo import Sampler
 
 CONFIG = "config.json"
 _SAMPLES = 2  # last word of the seeds that pick and order samples
@@ -57,29 +56,21 @@ def train(parts: Parts, counters: Counters, directory: Path, *, quiet: bool = Fa
         while counters.update < config.updates:
             started = time.perf_counter()
             update = counters.update
-            rollout = parts.collector.collect(Sampler(parts.ppo.policy), parts.length(update))
-            estimate = parts.estimator.estimate(rollout)
+            rollout = parts.collector.collect(Sampler(parts.learner.policy), parts.length(update))
             rng = np.random.default_rng([config.seed, update, _SAMPLES])
-            samples = samples_of(parts.graph, rollout, estimate, config.algorithm.ppo.keep_least, rng)
-            report = parts.ppo.update(samples, update / config.updates, rng)
+            report = parts.learner.learn(rollout, update / config.updates, rng)
             counters.update += 1
             counters.hours += rollout.time
             counters.decisions += rollout.decisions
             scores = parts.validate(counters, directory)
             counters.seconds += time.perf_counter() - started
-            log.update(_row(counters, rollout, estimate, report) | scores)
+            log.update(_row(counters, rollout) | report | scores)
             parts.save(counters, directory)
     return directory
 
 
-def _row(counters: Counters, rollout: Rollout, estimate: Estimate, report: UpdateReport) -> dict[str, float]:
-    """What is logged of an update, by the names of marl_sched.train.logging.COLUMNS."""
+def _row(counters: Counters, rollout: Rollout) -> dict[str, float]:
+    """What is logged of an update beside the learner's report, by the names of marl_sched.train.logging.COLUMNS."""
     done = asdict(counters)
     del done["best"]  # told with the validation that found it
-    return {
-        **done,
-        **asdict(report),
-        "reward_rate": rollout.reward_rate,
-        "length": rollout.length,
-        "explained_variance": estimate.explained_variance,
-    }
+    return {**done, "reward_rate": rollout.reward_rate, "length": rollout.length}

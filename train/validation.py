@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from marl_sched.agents.hetgat.network import HetGATNetwork
 from marl_sched.agents.hetgat.policy import HetGATPolicy
+from marl_sched.agents.learned.network import PolicyNetwork
 from marl_sched.domain import Domain, get_domain
 from marl_sched.train.config import TrainConfig
 from marl_sched.train.evaluate import Settings, evaluate_scheduler
@@ -26,7 +26,7 @@ class Validation:
             options=config.env.options,
         )
 
-    def __call__(self, network: HetGATNetwork) -> float:
+    def __call__(self, network: PolicyNetwork) -> float:
         """M1, the mean over instances and episodes."""
         scores = evaluate_scheduler(self._domain, HetGATPolicy(network), self._instances, self._settings)
         return float(scores.measures[str(self._settings.objective)].mean())

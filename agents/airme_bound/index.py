@@ -27,7 +27,7 @@ from marl_sched.agents.airme_bound.plane import (
     plane_model,
     reward_of,
 )
-from marl_sched.agents.base import ObservationScheduler, best_target
+from marl_sched.agents.base import AdvantageScheduler
 from marl_sched.envs.airme.aircraft import PUBLISHED_TYPES, AircraftType, FailureModel
 from marl_sched.envs.airme.graph import graph_spec
 from marl_sched.envs.airme.simulator import DEFAULT_HORIZON, AirmeSimulator
@@ -44,7 +44,7 @@ _HOURS, _LANDINGS, _INCOME, _BROKEN, _MISSION, _DONE = map(
 )
 
 
-class IndexScheduler(ObservationScheduler):
+class IndexScheduler(AdvantageScheduler):
     """Serve the open plane with the largest positive advantage per crew-hour.
 
     Args:
@@ -80,11 +80,19 @@ class IndexScheduler(ObservationScheduler):
 
     def choose(self, observation: Mapping[str, np.ndarray], uniform: np.ndarray) -> np.ndarray:
         """Targets int64 (B,); `uniform` is not used."""
+        return self.advantages(observation).argmax(axis=1)
+
+    def advantages(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
+        """What each target gains per crew-hour over doing nothing, float64 (B, n_targets), in units of the objective.
+
+        0 for doing nothing, -inf for a target that is not legal or whose plane will not fail any more.
+        """
         require_types(self.name, observation["plane"].shape[-1] - len(_FEATURES), self._problem[2])
         if self._tables is None:
             self._tables = _Tables(*self._problem, clock=self._clock)
-        scores = self._tables.indices(observation)
-        return best_target(scores, (np.asarray(observation["action_mask"]) > 0) & (scores > 0.0))
+        gains = np.where(np.asarray(observation["action_mask"]) > 0, self._tables.indices(observation), -np.inf)
+        gains[:, 0] = 0.0
+        return gains
 
 
 def require_types(scheduler: str, seen: int, types: Sequence[AircraftType]) -> None:

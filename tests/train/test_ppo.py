@@ -52,7 +52,7 @@ def poisoned(rollout: Rollout) -> Rollout:
 
 def learn(rollout: Rollout, policy: HetGATNetwork, critic: HetGATCritic, keep_least: float = 1.0) -> list[torch.Tensor]:
     estimator = CriticEstimator(critic, discount=0.9, trace=0.9, centred=True)
-    samples = samples_of(policy.spec, rollout, estimator.estimate(rollout), keep_least, np.random.default_rng(0))
+    samples = samples_of(policy, rollout, estimator.estimate(rollout), keep_least, np.random.default_rng(0))
     ppo = Ppo(policy, critic, CONFIG)
     for _ in range(2):
         ppo.update(samples, 0.0, np.random.default_rng(1))
@@ -123,8 +123,8 @@ def test_kept_turns_weigh_as_much_as_all_turns_in_expectation():
     rollout = segment(policy)
     everything = Estimate(torch.randn(rollout.rewards.shape, dtype=torch.float64), None, 0.0)
     rng = np.random.default_rng(0)
-    all_turns = samples_of(policy.spec, rollout, everything, 1.0, rng)
-    drawn = [samples_of(policy.spec, rollout, everything, 0.2, rng) for _ in range(300)]
+    all_turns = samples_of(policy, rollout, everything, 1.0, rng)
+    drawn = [samples_of(policy, rollout, everything, 0.2, rng) for _ in range(300)]
     assert np.mean([len(samples["weight"]) for samples in drawn]) < 0.8 * len(all_turns["weight"])
     sums = torch.stack([samples["weight"].double() @ samples["advantage"].double().square() for samples in drawn])
     truth = all_turns["advantage"].double().square().sum()
@@ -136,7 +136,7 @@ def test_a_better_choice_becomes_more_probable():
     rollout = EpisodeCollector(environment(rows=4, episodes=2), central=False).collect(Sampler(policy), 10)
     good = rollout.targets == 0
     estimate = Estimate(torch.where(good, 1.0, -1.0).double(), None, 0.0)
-    samples = samples_of(policy.spec, rollout, estimate, 1.0, np.random.default_rng(0))
+    samples = samples_of(policy, rollout, estimate, 1.0, np.random.default_rng(0))
     idle = samples["target"] == 0
     assert idle.any()
     before = policy(samples["observation"]).softmax(-1)[:, 0].mean()
@@ -153,7 +153,7 @@ def test_the_step_baseline_needs_no_critic():
     assert estimate.value_targets is None
     assert (estimate.advantages[~rollout.valid[:-1]] == 0).all()
     report = Ppo(policy, None, CONFIG).update(
-        samples_of(policy.spec, rollout, estimate, 1.0, np.random.default_rng(0)), 0.5, np.random.default_rng(0)
+        samples_of(policy, rollout, estimate, 1.0, np.random.default_rng(0)), 0.5, np.random.default_rng(0)
     )
     assert report.value_loss == 0.0
     assert report.entropy > 0

@@ -95,7 +95,7 @@ def test_learning_changes_the_weights_and_seeds_change_the_run(tmp_path: Path):
         runs[seed] = checkpoint(
             train_from_overrides([*GAE, f"seed={seed}", f"run_dir={tmp_path / str(seed)}"], quiet=True)
         )
-    fresh = build(RunRecord(config=load_config(GAE), overrides=GAE, revision="")).ppo.policy.state_dict()
+    fresh = build(RunRecord(config=load_config(GAE), overrides=GAE, revision="")).learner.policy.state_dict()
     changed = [not np.array_equal(tensor.numpy(), runs[0][f"policy.{name}"]) for name, tensor in fresh.items()]
     assert any(changed)
     assert any(not np.array_equal(runs[0][name], runs[1][name]) for name in runs[0] if name.startswith("policy."))

@@ -1,0 +1,132 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from marl_sched.agents.base import AdvantageScheduler
+from marl_sched.agents.cards import read_card
+from marl_sched.agents.hetgat.network import HetGATNetwork
+from marl_sched.domain import get_domain
+from marl_sched.envs.airme.views import LocalView
+from marl_sched.envs.torchrl_env import SchedulingTorchRL
+from marl_sched.errors import InvalidOptionError
+from marl_sched.train.collect import InstanceSource, Rollout, SegmentCollector
+from marl_sched.train.config import ImitationConfig
+from marl_sched.train.imitation import Imitation, cross_entropy
+from marl_sched.train.ppo import Sampler
+from marl_sched.train.run import train_from_overrides
+
+CONFIG = ImitationConfig(
+    instances=6, turns=20, teacher="none", epochs=1, minibatch=64, learning_rate=1e-2, final_learning_rate=1e-2,
+    temperature=0.1, final_temperature=0.1, max_gradient=1.0, keep_least=1.0,
+)  # fmt: skip
+
+
+class Oldest(AdvantageScheduler):
+    """Likes planes by their hours, less five; a true state of which it can be told."""
+
+    name = "oldest"
+
+    def choose(self, observation, uniform):
+        return self.advantages(observation).argmax(1)
+
+    def advantages(self, observation):
+        gains = np.where(np.asarray(observation["action_mask"]) > 0, observation["plane"][..., 0] - 5.0, -np.inf)
+        gains[:, 0] = 0.0
+        return gains
+
+
+def rollout(policy: HetGATNetwork, *, staleness: int = 0, turns: int = 20) -> Rollout:
+    source = InstanceSource(get_domain("airme"), ["small"], seed=3, rows=6)
+    view = LocalView(staleness=staleness)
+    env = SchedulingTorchRL("airme", batch_size=6, source=source, view=view, horizon=100, seed=3)
+    return SegmentCollector(env, turns=turns, length=40, central=True).collect(Sampler(policy), 40)
+
+
+@pytest.fixture
+def policy() -> HetGATNetwork:
+    torch.manual_seed(0)
+    env = SchedulingTorchRL("airme", batch_size=1, horizon=10)
+    return HetGATNetwork(env.simulator.graph, width=4, heads=2, layers=2)
+
+
+def test_cross_entropy_is_that_of_the_wanted_distribution_and_ignores_illegal_targets() -> None:
+    log_probs = torch.tensor([[0.25, 0.75, 0.0]]).log().clamp(min=torch.finfo(torch.float32).min)
+    wanted = torch.tensor([[0.5, 0.5, 0.0]])
+    expected = -(0.5 * np.log(0.25) + 0.5 * np.log(0.75))
+    torch.testing.assert_close(cross_entropy(log_probs, wanted), torch.tensor([expected], dtype=torch.float32))
+
+
+def test_a_policy_comes_to_choose_what_its_teacher_would(policy: HetGATNetwork) -> None:
+    learner, rng = Imitation(policy, Oldest(), CONFIG), np.random.default_rng(0)
+    played = rollout(policy)
+    regrets = [learner.learn(played, 0.0, rng)["regret"] for _ in range(60)]
+    assert regrets[-1] < 0.3 * regrets[0]
+
+
+def test_the_teacher_is_asked_about_the_true_state(policy: HetGATNetwork) -> None:
+    asked: list[dict[str, np.ndarray]] = []
+
+    class Listening(Oldest):
+        def advantages(self, observation):
+            asked.append(dict(observation))
+            return super().advantages(observation)
+
+    played = rollout(policy, staleness=12)
+    Imitation(policy, Listening(), CONFIG).learn(played, 0.0, np.random.default_rng(0))
+    valid = played.valid[:-1].flatten()
+    np.testing.assert_array_equal(asked[0]["plane"], played.central["plane"][:20].flatten(0, 1)[valid].numpy())
+    assert not np.array_equal(asked[0]["plane"], played.observation["plane"][:20].flatten(0, 1)[valid].numpy())
+
+
+def test_what_turns_that_are_not_valid_hold_does_not_matter(policy: HetGATNetwork) -> None:
+    state = {name: value.clone() for name, value in policy.state_dict().items()}
+    clean = rollout(policy, turns=60)
+    gone = ~clean.valid
+    assert gone[:-1].any()
+    spoilt = {
+        name: torch.where(gone.view(*gone.shape, *[1] * (v.dim() - 2)), torch.nan, v) if v.is_floating_point() else v
+        for name, v in clean.observation.items()
+    }
+    learned = []
+    for played in (
+        clean,
+        replace(clean, observation=spoilt, log_probs=clean.log_probs.masked_fill(gone[:-1], torch.nan)),
+    ):
+        policy.load_state_dict(state)
+        Imitation(policy, Oldest(), CONFIG).learn(played, 0.0, np.random.default_rng(0))
+        learned.append([parameter.detach().clone() for parameter in policy.parameters()])
+    for a, b in zip(*learned, strict=True):
+        assert torch.isfinite(a).all()
+        assert torch.equal(a, b)
+
+
+TINY = [
+    "policy.width=2", "policy.heads=2", "policy.layers=1", "validation.instances=2", "validation.length=20",
+    "validation.every=2", "updates=2", "curriculum.start=20", "curriculum.stop=20",
+]  # fmt: skip
+
+
+def test_a_run_imitates_the_index_then_another_goes_on_from_its_policy(tmp_path) -> None:
+    imitation = [*TINY, "algorithm=imitation", "algorithm.instances=4", "algorithm.turns=8"]
+    first = train_from_overrides([*imitation, f"run_dir={tmp_path / 'a'}"], quiet=True)
+    assert read_card(first / "policy.json").training_knowledge == "imitation of index-without-clock (failure model)"
+
+    ppo = [*TINY, "algorithm.instances=4", "algorithm.turns=8", f"start_from={first / 'policy.safetensors'}"]
+    second = train_from_overrides([*ppo, "view=local", f"run_dir={tmp_path / 'b'}"], quiet=True)
+    told = read_card(second / "policy.json").training_knowledge
+    assert told == "imitation of index-without-clock (failure model), a critic on the full graph"
+
+
+def test_a_network_of_other_sizes_cannot_be_gone_on_from(tmp_path) -> None:
+    with pytest.raises(InvalidOptionError, match="start_from: expected a network of"):
+        train_from_overrides([*TINY, "start_from=airme-full-profit", f"run_dir={tmp_path / 'a'}"], quiet=True)
+
+
+def test_a_rule_that_scores_nothing_cannot_teach(tmp_path) -> None:
+    overrides = [*TINY, "algorithm=imitation", "algorithm.teacher=corrective", f"run_dir={tmp_path / 'a'}"]
+    with pytest.raises(InvalidOptionError, match=r"algorithm\.teacher"):
+        train_from_overrides(overrides, quiet=True)

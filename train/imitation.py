@@ -1,0 +1,100 @@
+"""Imitation learning from a scheduler that can tell how good every choice is.
+
+The policy that learns also plays, so that it meets its own mistakes (DAgger; Ross et al. 2011). In every state
+that it comes to the teacher, which may know more (the true state of what the agent sees late or not at all,
+the failure model), says what each choice is worth, A(a). The policy learns the distribution
+softmax(A / temperature) over legal targets by cross-entropy: the colder, the finer the differences that it must
+tell, and the surer the sign of a small advantage. That sign matters more than its size: a plane that is worth
+a little now and left standing is left standing again an hour later.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from marl_sched.agents.base import AdvantageScheduler
+from marl_sched.agents.learned.network import PolicyNetwork
+from marl_sched.graph import ACTION_MASK
+from marl_sched.train.collect import Rollout
+from marl_sched.train.config import ImitationConfig
+from marl_sched.train.ppo import between, minibatches, thinned
+
+LEAST = -10.0  # no choice counts as worse than this, in units of what the best choice is usually worth
+
+
+class Imitation:
+    """Learns what a teacher would choose.
+
+    Args:
+        policy: observation -> logits (N, n_targets).
+        teacher: started on the simulator of the rollouts.
+        config: see ImitationConfig.
+    """
+
+    def __init__(self, policy: PolicyNetwork, teacher: AdvantageScheduler, config: ImitationConfig) -> None:
+        self.policy, self._teacher, self._config = policy, teacher, config
+        self.modules: dict[str, nn.Module] = {"policy": policy}
+        self.optimizer = torch.optim.Adam(policy.parameters(), fused=True)
+        self._scale: float | None = None
+
+    def learn(self, rollout: Rollout, progress: float, rng: np.random.Generator) -> dict[str, float]:
+        """Ask the teacher about every turn that is kept, then take gradient steps."""
+        config = self._config
+        samples = self._samples(rollout, rng)
+        temperature = between(config.temperature, config.final_temperature, progress)
+        for group in self.optimizer.param_groups:
+            group["lr"] = between(config.learning_rate, config.final_learning_rate, progress)
+        reports = [
+            self._step(samples[indices], temperature)
+            for indices in minibatches(samples.shape[0], config.minibatch, config.epochs, rng)
+        ]
+        names = ("policy_loss", "regret", "entropy", "gradient")
+        return dict(zip(names, np.mean(reports, axis=0).tolist(), strict=True))
+
+    def _samples(self, rollout: Rollout, rng: np.random.Generator) -> TensorDict:
+        samples, names, rows = thinned(self.policy, rollout, self._config.keep_least, rng)
+        turns = rollout.targets.shape[0]
+        truth = {name: v[:turns].flatten(0, 1)[rows].numpy() for name, v in rollout.central.items()}
+        advantages = self._teacher.advantages(truth)
+        if self._scale is None:
+            self._scale = float(advantages.max(axis=1).mean()) or 1.0
+        scaled = torch.from_numpy(np.maximum(advantages / self._scale, LEAST)).float()
+        # A target that the agent may choose but that is taken in truth costs it the hour: as much as waiting.
+        scaled = torch.where(torch.from_numpy(truth[ACTION_MASK] != 0), scaled, 0.0)
+        samples["advantage"] = scaled.gather(1, names)
+        return samples
+
+    def _step(self, batch: TensorDict, temperature: float) -> tuple[float, ...]:
+        share = batch["weight"] / batch["weight"].sum()
+        log_probs = self.policy(batch["observation"]).log_softmax(-1)
+        legal = batch["observation"][ACTION_MASK] != 0
+        advantages = torch.where(legal, batch["advantage"], -torch.inf)
+        loss = share @ cross_entropy(log_probs, (advantages / temperature).softmax(-1))
+        self.optimizer.zero_grad()
+        loss.backward()
+        norm = nn.utils.clip_grad_norm_(self.policy.parameters(), self._config.max_gradient)
+        self.optimizer.step()
+        with torch.no_grad():
+            probs = log_probs.exp()
+            regret = share @ (advantages.max(1).values - (probs * batch["advantage"]).sum(-1))
+            entropy = share @ cross_entropy(log_probs, probs)
+        return tuple(value.item() for value in (loss, regret, entropy, norm))
+
+    def state(self) -> dict[str, float | None]:
+        """The scale of advantages."""
+        return {"scale": self._scale}
+
+    def restore(self, state: dict[str, float | None]) -> None:
+        """The scale of advantages."""
+        self._scale = state["scale"]
+
+
+def cross_entropy(log_probs: Tensor, wanted: Tensor) -> Tensor:
+    """Of a policy relative to wanted distributions, both (N, n_targets), in nats, (N,).
+
+    Targets that are not legal have the lowest finite log-probability and are wanted with probability 0.
+    """
+    return -(wanted * log_probs).sum(-1)

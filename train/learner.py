@@ -1,0 +1,64 @@
+"""What learns from rollouts. The training loop knows no more of an algorithm than this."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import nn
+
+from marl_sched.agents.learned.network import PolicyNetwork
+from marl_sched.train.collect import Rollout
+from marl_sched.train.estimators import Estimator
+from marl_sched.train.ppo import Ppo, samples_of
+
+
+class Learner(Protocol):
+    """A policy and whatever else is learned with it.
+
+    Attributes:
+        policy: what plays.
+        modules: everything with parameters, the policy among them, by name.
+        optimizer: of all of them.
+    """
+
+    policy: PolicyNetwork
+    modules: dict[str, nn.Module]
+    optimizer: torch.optim.Adam
+
+    def learn(self, rollout: Rollout, progress: float, rng: np.random.Generator) -> dict[str, float]:
+        """Learn from a rollout; what is logged of it, by the names of marl_sched.train.logging.COLUMNS.
+
+        `progress` in [0, 1] is how far the run has come, `rng` picks and orders samples.
+        """
+
+    def state(self) -> dict[str, float | None]:
+        """What a resumed run needs beside modules and optimizer, as JSON."""
+
+    def restore(self, state: dict[str, float | None]) -> None:
+        """Go on from a saved state."""
+
+
+class PolicyGradient:
+    """PPO on the advantages of an estimator."""
+
+    def __init__(self, ppo: Ppo, estimator: Estimator) -> None:
+        self._ppo, self._estimator = ppo, estimator
+        self.policy, self.modules, self.optimizer = ppo.policy, ppo.modules, ppo.optimizer
+
+    def learn(self, rollout: Rollout, progress: float, rng: np.random.Generator) -> dict[str, float]:
+        """Estimate advantages, then optimise the clipped surrogate."""
+        estimate = self._estimator.estimate(rollout)
+        samples = samples_of(self.policy, rollout, estimate, self._ppo.config.keep_least, rng)
+        report = self._ppo.update(samples, progress, rng)
+        return {**asdict(report), "explained_variance": estimate.explained_variance}
+
+    def state(self) -> dict[str, float | None]:
+        """The estimator's."""
+        return self._estimator.state()
+
+    def restore(self, state: dict[str, float | None]) -> None:
+        """The estimator's."""
+        self._estimator.restore(state)
