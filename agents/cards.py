@@ -97,8 +97,9 @@ def read_card(path: str | Path) -> PolicyCard:
     Cards that name no architecture are from when there was one.
     """
     content = read_json(path)
-    if isinstance(content, dict) and isinstance(content.get("sizes"), dict):
-        content["sizes"].setdefault(_ARCHITECTURE, "hetgat")
+    match content:
+        case {"sizes": dict() as sizes}:
+            sizes.setdefault(_ARCHITECTURE, "hetgat")
     try:
         card = msgspec.convert(content, PolicyCard)
     except msgspec.ValidationError as error:
