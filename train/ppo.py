@@ -16,7 +16,7 @@ from marl_sched.agents.learned.network import PolicyNetwork
 from marl_sched.graph import ACTION_MASK
 from marl_sched.train.advantages import normalised
 from marl_sched.train.collect import Rollout
-from marl_sched.train.compaction import compacted
+from marl_sched.agents.learned.compaction import compacted
 from marl_sched.train.config import PpoConfig
 from marl_sched.train.estimators import Estimate
 
