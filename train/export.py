@@ -10,9 +10,9 @@ import msgspec
 from marl_sched.agents.cards import PolicyCard, read_card
 from marl_sched.agents.hetgat.policy import HetGATPolicy
 from marl_sched.agents.learned.checkpoint import load_network, save_network
-from marl_sched.agents.learned.network import PolicyNetwork
+from marl_sched.agents.learned.network import PolicyNetwork, slots_of
 from marl_sched.agents.registry import create_scheduler, policy_path
-from marl_sched.domain import get_domain
+from marl_sched.domain import Domain, get_domain
 from marl_sched.train.config import GaeConfig, ImitationConfig, RunRecord, TrainConfig
 from marl_sched.train.evaluate import Settings, evaluate_scheduler
 
@@ -76,14 +76,15 @@ def export_policy(
 ) -> PolicyCard:
     """Measure a run's best policy, greedy, on unseen instances of each scale, and write it with those scores to `path`.
 
-    `scales` None: all of the domain's. Instances and noise are those of `marl-sched evaluate --seed SEED`;
-    `length` is the simulated time of an episode, None: the environment's. Returns the card as written.
+    `scales` None: all of the domain's whose padded sizes its network can read. Instances and noise are those of
+    `marl-sched evaluate --seed SEED`; `length` is the simulated time of an episode, None: the environment's.
+    Returns the card as written.
     """
     network, card = load_network(run_dir / BEST)
     domain = get_domain(card.domain)
     view = domain.make_view(card.view)
     measured = {}
-    for scale in domain.scales if scales is None else scales:
+    for scale in _readable(network, domain) if scales is None else scales:
         settings = Settings(
             episodes=episodes, seed=seed, view=view, objective=card.objective, horizon=length, scale=scale
         )
@@ -99,3 +100,13 @@ def export_policy(
         }
     save_network(path, network, msgspec.structs.replace(card, scores={**card.scores, **measured}))
     return load_network(path)[1]
+
+
+def _readable(network: PolicyNetwork, domain: Domain) -> list[str]:
+    """The domain's scales whose observations a network can read."""
+    readable = []
+    for scale in domain.scales:
+        simulator = domain.simulator(domain.instances(scale, 1, 0), pad=scale)
+        if network.reads(slots_of(simulator.graph, simulator.arrays)):
+            readable.append(scale)
+    return readable

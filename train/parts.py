@@ -14,7 +14,7 @@ from marl_sched.agents.cards import DecimaSizes, DeepRMSizes, HetGATSizes, Sizes
 from marl_sched.agents.hetgat.network import HetGATCritic
 from marl_sched.agents.learned.architectures import new_network
 from marl_sched.agents.learned.checkpoint import load_network
-from marl_sched.agents.learned.network import PolicyNetwork
+from marl_sched.agents.learned.network import PolicyNetwork, slots_of
 from marl_sched.agents.registry import create_scheduler, policy_path
 from marl_sched.domain import get_domain
 from marl_sched.envs.torchrl_env import SchedulingTorchRL
@@ -152,9 +152,7 @@ def _sizes(policy: PolicyConfig, env: SchedulingTorchRL) -> Sizes:
         case DecimaConfig():
             return DecimaSizes(**given)
         case DeepRMConfig():
-            simulator = env.simulator
-            slots = {node.name: simulator.arrays[node.name].shape[0] for node in simulator.graph.nodes}
-            return DeepRMSizes(**given, slots=slots)
+            return DeepRMSizes(**given, slots=slots_of(env.simulator.graph, env.simulator.arrays))
 
 
 def _environment(config: TrainConfig, length: EpisodeLength, *, rows: int, episodes: int) -> SchedulingTorchRL:

@@ -13,9 +13,10 @@ neither do agents (crews), which the bipartite graph does not contain.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import cast
 
-import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn import functional
 
 from marl_sched.agents.cards import DecimaSizes
 from marl_sched.agents.learned.network import (
@@ -56,5 +57,13 @@ class DecimaNetwork(PolicyNetwork):
         embedded = self.f(features)
         hidden = observation[f"{task}_mask"] == 0
         state = self.g(embedded.masked_fill(hidden[..., None], 0.0).sum(1, keepdim=True))
-        scores = self.q(torch.cat([embedded, state.expand_as(embedded)], dim=-1))
-        return only_legal(scores.squeeze(-1), observation)
+        return only_legal(self._scores(embedded, state).squeeze(-1), observation)
+
+    def _scores(self, embedded: Tensor, state: Tensor) -> Tensor:
+        """The scores q (B, n, 1) of embeddings (B, n, hidden), each beside its graph's state (B, 1, hidden).
+
+        The first layer's product with the state is the same for all tasks of a graph, and is made once.
+        """
+        first, rest = cast(nn.Linear, self.q[0]), self.q[1:]
+        of_task, of_state = first.weight.split(embedded.shape[-1], dim=1)
+        return rest(functional.linear(embedded, of_task, first.bias) + functional.linear(state, of_state))

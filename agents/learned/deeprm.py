@@ -50,17 +50,20 @@ class DeepRMNetwork(PolicyNetwork):
         self.stack = fully_connected(n_in, hidden, slots[spec.decision_of], layers)
         explore_at_first(self.stack)
 
+    def reads(self, slots: Mapping[str, int]) -> bool:
+        """Only those that it was made for."""
+        return dict(slots) == self.sizes.slots
+
     def forward(self, observation: Mapping[str, Tensor], weights: None = None) -> Tensor:
         """Logits (B, n_targets), see PolicyNetwork.
 
         Raises InvalidOptionError for an observation with other numbers of slots.
         """
-        slots = self.sizes.slots
-        found = {name: observation[name].shape[1] for name in slots}
-        if found != slots:
+        found = {name: observation[name].shape[1] for name in self.sizes.slots}
+        if not self.reads(found):
             raise InvalidOptionError(
-                f"observation: a DeepRM network for slots {_counted(slots)} cannot read one with {_counted(found)}; "
-                "it needs a model of its own for every scale"
+                f"observation: a DeepRM network for slots {_counted(self.sizes.slots)} cannot read one with "
+                f"{_counted(found)}; every scale needs a model of its own"
             )
         dtype = next(self.parameters()).dtype
         flat = [visible_features(observation, node.name, dtype).flatten(1) for node in self.spec.nodes]

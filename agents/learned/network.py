@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from marl_sched.agents.cards import Sizes
-from marl_sched.graph import ACTION_MASK, GraphSpec
+from marl_sched.graph import ACTION_MASK, ArraySpec, GraphSpec
 
 
 class PolicyNetwork(nn.Module, ABC):
@@ -32,6 +32,10 @@ class PolicyNetwork(nn.Module, ABC):
         """What can be prepared once for many forward passes with fixed parameters; here nothing."""
         return None
 
+    def reads(self, slots: Mapping[str, int]) -> bool:
+        """Whether it can read observations with these numbers of slots (node type -> slots); this one any."""
+        return True
+
     @abstractmethod
     def forward(self, observation: Mapping[str, Tensor], weights: Any = None) -> Tensor:
         """Logits (B, n_targets) from the tensors of an observation (marl_sched.graph, with batch axis).
@@ -39,6 +43,11 @@ class PolicyNetwork(nn.Module, ABC):
         `weights` are those of the method `weights`, prepared here if not given. Targets outside the action mask
         get the dtype's lowest finite number. Hidden and padded entries may hold anything, NaN included.
         """
+
+
+def slots_of(spec: GraphSpec, arrays: Mapping[str, ArraySpec]) -> dict[str, int]:
+    """Node type -> number of slots that observations with these arrays have."""
+    return {node.name: arrays[node.name].shape[0] for node in spec.nodes}
 
 
 def fully_connected(n_in: int, hidden: int, n_out: int, layers: int) -> nn.Sequential:
