@@ -13,10 +13,11 @@ from torch import Tensor
 
 from marl_sched.agents.base import ObservationScheduler
 from marl_sched.agents.cards import PolicyCard, check_graph
+from marl_sched.agents.learned.batches import logits_in_blocks
 from marl_sched.agents.learned.checkpoint import load_network
 from marl_sched.agents.learned.network import PolicyNetwork
 from marl_sched.errors import InvalidOptionError
-from marl_sched.graph import STATE, TIME, VISIBLE_SHARE, GraphSpec
+from marl_sched.graph import ACTION_MASK, STATE, TIME, VISIBLE_SHARE, GraphSpec
 from marl_sched.simulation import TurnSimulator
 
 Mode = Literal["greedy", "sample"]
@@ -26,7 +27,8 @@ class HetGATPolicy(ObservationScheduler):
     """Decides by a copy of a HetGAT network.
 
     At batch size 1 a choice is a function of the observation's bits, the padding included; in a larger batch
-    logits agree within 1e-5.
+    logits agree within 1e-5, as the network then sees it in blocks without what nobody sees
+    (marl_sched.agents.learned.batches).
 
     Args:
         network: on the CPU.
@@ -74,7 +76,16 @@ class HetGATPolicy(ObservationScheduler):
             if self.card is not None:
                 check_graph(f"{self.name}.json", self.card, simulator.graph)
             self._checked = simulator.graph
-        return super().decide(simulator)
+        agents = simulator.acting
+        acting = agents >= 0
+        if acting.all():
+            return super().decide(simulator)
+        # Rows that are over would cost as much as the others: episodes of a batch end at different turns.
+        targets = np.zeros(simulator.batch, np.int64)
+        if acting.any():
+            observation = {name: values[acting] for name, values in simulator.observe(agents).items()}
+            targets[acting] = self.choose(observation, simulator.policy_noise(agents)[acting])
+        return targets
 
     def choose(self, observation: Mapping[str, np.ndarray], uniform: np.ndarray) -> np.ndarray:
         """Targets int64 (B,) from batched observations and uniforms float64 (B,) in [0, 1)."""
@@ -94,7 +105,9 @@ class HetGATPolicy(ObservationScheduler):
                     f"observation: {name}: policy {self.name} expects {n_features} features, got shape {shape}"
                 )
         tensors = {name: _tensor(observation[name]) for name in self._arrays}
-        return self._network(tensors, self._weights).numpy()
+        if len(tensors[ACTION_MASK]) == 1:
+            return self._network(tensors, self._weights).numpy()
+        return logits_in_blocks(self._network, tensors, self._weights).numpy()
 
 
 def inverse_distribution(logits: np.ndarray, uniform: np.ndarray) -> np.ndarray:

@@ -5,6 +5,8 @@ import pytest
 import torch
 
 from marl_sched.agents.hetgat.network import HetGATNetwork
+from marl_sched.agents.learned import batches
+from marl_sched.agents.learned.batches import logits_in_blocks
 from marl_sched.agents.learned.compaction import compacted
 from marl_sched.domain import get_domain
 
@@ -74,3 +76,28 @@ def test_targets_keep_their_names_and_target_0_stays_first():
         kept = names[row][small["plane_mask"][row] != 0]
         assert kept.tolist() == observation["plane_mask"][row].nonzero().squeeze(1).tolist()
         assert torch.equal(small["action_mask"][row], observation["action_mask"][row][names[row]])
+
+
+@pytest.mark.parametrize("block_nodes", [1, 40, 10_000])
+@pytest.mark.parametrize(("domain", "turns"), [("airme", 40), ("murse", 7)])
+def test_blocks_of_any_size_give_the_logits_of_the_whole(domain: str, turns: int, block_nodes: int, monkeypatch):
+    graph, observation = played(domain, turns)
+    network = network_for(graph, torch.float32)
+    monkeypatch.setattr(batches, "BLOCK_NODES", block_nodes)
+    whole, ours = network(observation), logits_in_blocks(network, observation, network.weights())
+    assert ours.shape == whole.shape
+    torch.testing.assert_close(ours, whole, rtol=1e-5, atol=1e-5)
+    assert torch.equal(ours.argmax(1), whole.argmax(1))
+
+
+def test_nodes_of_a_network_that_tells_slots_apart_stay_in_theirs():
+    graph, observation = played("airme", 3)
+
+    class BySlot(HetGATNetwork):
+        permutable = False
+
+        def forward(self, observation, weights=None):
+            return observation["plane"].sum(2) * torch.arange(observation["plane"].shape[1])
+
+    network = BySlot(graph)
+    assert torch.equal(logits_in_blocks(network, observation, None), network(observation))

@@ -9,6 +9,7 @@ from scipy.stats import chisquare
 
 from marl_sched.agents.hetgat.network import HetGATNetwork
 from marl_sched.agents.hetgat.policy import HetGATPolicy, inverse_distribution
+from marl_sched.domain import get_domain
 from marl_sched.errors import InvalidOptionError
 from marl_sched.graph import ACTION_MASK
 
@@ -132,3 +133,18 @@ def test_a_missing_array_is_refused(network, observation):
 def test_an_unknown_mode_is_refused(network):
     with pytest.raises(InvalidOptionError, match="expected one of greedy, sample, got 'warm'"):
         HetGATPolicy(network, mode="warm")
+
+
+def test_rows_that_are_over_get_0_and_change_no_other_choice():
+    domain = get_domain("airme")
+    simulator = domain.simulator(domain.instances("small", 4, 0), horizon=3, pad="small")
+    torch.manual_seed(0)
+    policy = HetGATPolicy(HetGATNetwork(simulator.graph), mode="sample")
+    while simulator.over.sum() < 2:
+        simulator.step(policy.decide(simulator))
+    acting = simulator.acting >= 0
+    assert acting.any()
+    whole = policy.choose(simulator.observe(simulator.acting), simulator.policy_noise(simulator.acting))
+    targets = policy.decide(simulator)
+    assert (targets[~acting] == 0).all()
+    assert (targets[acting] == whole[acting]).all()
