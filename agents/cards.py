@@ -24,6 +24,7 @@ Width = Annotated[int, Meta(ge=1, le=1024)]
 Heads = Annotated[int, Meta(ge=1, le=64)]
 Layers = Annotated[int, Meta(ge=1, le=32)]
 Slots = Annotated[int, Meta(ge=1, le=65536)]
+Mode = Literal["greedy", "sample"]
 _ARCHITECTURE = "architecture"
 
 
@@ -68,6 +69,7 @@ class PolicyCard(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         scores: measured, for example `{"small": {"M1": 0.7, "instances": 100, "episodes": 10}}`.
         training_knowledge: what training used beyond the view, such as a critic on the full graph; the
             policy itself sees its view and nothing else.
+        mode: how it decides unless told otherwise, and decided when the scores were measured.
         weights_sha256: of the safetensors file.
         schema: of this card.
     """
@@ -82,6 +84,7 @@ class PolicyCard(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     seed: int
     scores: dict[str, Any]
     training_knowledge: str = ""
+    mode: Mode = "greedy"
     weights_sha256: str = ""
     schema: Literal[1] = 1
 

@@ -12,10 +12,10 @@ from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from marl_sched.agents.base import Scheduler
-from marl_sched.agents.cards import PolicyCard, read_card
+from marl_sched.agents.cards import Mode, PolicyCard, read_card
 from marl_sched.domain import Domain
 from marl_sched.errors import InvalidFileError, MarlSchedError, UnknownNameError
 
@@ -74,14 +74,12 @@ def create_scheduler(name_or_path: str | Path, domain: Domain | str, **options: 
     return policy
 
 
-def load_policy(
-    name_or_path: str | Path, *, mode: Literal["greedy", "sample"] = "greedy", graph: GraphSpec | None = None
-) -> HetGATPolicy:
+def load_policy(name_or_path: str | Path, *, mode: Mode | None = None, graph: GraphSpec | None = None) -> HetGATPolicy:
     """A trained policy by its shipped name, or by the path of its weights or its card.
 
-    `mode` is `greedy` or `sample`. With a `graph` a policy that was trained on another metagraph is refused.
-    Raises UnknownNameError for a name that does not ship, InvalidFileError for damaged files, MarlSchedError
-    without PyTorch.
+    `mode` is `greedy` or `sample`, None: as its card says. With a `graph` a policy that was trained on another
+    metagraph is refused. Raises UnknownNameError for a name that does not ship, InvalidFileError for damaged
+    files, MarlSchedError without PyTorch.
     """
     path = policy_path(name_or_path)
     try:

@@ -21,7 +21,7 @@ from msgspec import Meta, Struct
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from marl_sched.agents.cards import Heads, Layers, Width
+from marl_sched.agents.cards import Heads, Layers, Mode, Width
 from marl_sched.domain import get_domain
 from marl_sched.errors import InvalidFileError, InvalidOptionError
 from marl_sched.files import read_json
@@ -139,13 +139,17 @@ class CurriculumConfig(_Config, frozen=True, kw_only=True):
 
 
 class ValidationConfig(_Config, frozen=True, kw_only=True):
-    """Greedy evaluation every so many updates on fixed instances of the first scale, `length` None: whole episodes."""
+    """Evaluation every so many updates on fixed instances of the first scale, `length` None: whole episodes.
+
+    `mode` is how the policy decides there, and then wherever its card is loaded.
+    """
 
     every: Count
     instances: Count
     episodes: Count
     seed: Seed
     length: Count | None
+    mode: Mode = "greedy"
 
 
 class TrainConfig(_Config, frozen=True, kw_only=True):

@@ -42,6 +42,7 @@ def save_best(network: PolicyNetwork, record: RunRecord, update: int, score: flo
         seed=config.seed,
         scores={"validation": measured},
         training_knowledge=knowledge(config),
+        mode=validation.mode,
     )
     save_network(directory / BEST, network, card)
 
@@ -74,7 +75,7 @@ def export_policy(
     seed: int = 1,
     length: int | None = None,
 ) -> PolicyCard:
-    """Measure a run's best policy, greedy, on unseen instances of each scale, and write it with those scores to `path`.
+    """Measure a run's best policy on unseen instances of each scale, and write it with those scores to `path`.
 
     `scales` None: all of the domain's whose padded sizes its network can read. Instances and noise are those of
     `marl-sched evaluate --seed SEED`; `length` is the simulated time of an episode, None: the environment's.
@@ -88,7 +89,8 @@ def export_policy(
         settings = Settings(
             episodes=episodes, seed=seed, view=view, objective=card.objective, horizon=length, scale=scale
         )
-        scores = evaluate_scheduler(domain, HetGATPolicy(network), domain.instances(scale, instances, seed), settings)
+        policy = HetGATPolicy(network, mode=card.mode)
+        scores = evaluate_scheduler(domain, policy, domain.instances(scale, instances, seed), settings)
         means = scores.measures[card.objective].mean(axis=1)
         measured[scale] = {
             "M1": float(means.mean()),

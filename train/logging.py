@@ -73,7 +73,7 @@ class RunLog:
                 self._writer.add_scalar(name, value, done)
         self._validation = values.get("validation", self._validation)
         self._best = values.get("best", self._best)
-        text = f"M1 sampled {values['reward_rate']:.3f}, greedy {self._validation:.4f}, best {self._best:.4f}"
+        text = f"M1 sampled {values['reward_rate']:.3f}, validated {self._validation:.4f}, best {self._best:.4f}"
         self._bar.update(self._task, completed=done, description=text)
 
 

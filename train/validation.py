@@ -1,4 +1,4 @@
-"""Which of a run's policies is best: greedy play on fixed instances with the same noise every time."""
+"""Which of a run's policies is best: play on fixed instances with the same noise every time."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from marl_sched.train.evaluate import Settings, evaluate_scheduler
 
 
 class Validation:
-    """The mean of the run's objective that a network reaches, played greedily on the validation instances."""
+    """The mean of the run's objective that a network reaches on the validation instances."""
 
     def __init__(self, config: TrainConfig) -> None:
+        self._mode = config.validation.mode
         self._domain: Domain = get_domain(config.env.name)
         scale = config.env.scales[0]
         self._instances = self._domain.instances(scale, config.validation.instances, config.validation.seed)
@@ -28,5 +29,6 @@ class Validation:
 
     def __call__(self, network: PolicyNetwork) -> float:
         """M1, the mean over instances and episodes."""
-        scores = evaluate_scheduler(self._domain, HetGATPolicy(network), self._instances, self._settings)
+        policy = HetGATPolicy(network, mode=self._mode)
+        scores = evaluate_scheduler(self._domain, policy, self._instances, self._settings)
         return float(scores.measures[str(self._settings.objective)].mean())

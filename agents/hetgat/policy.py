@@ -5,22 +5,20 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from marl_sched.agents.base import ObservationScheduler
-from marl_sched.agents.cards import PolicyCard, check_graph
+from marl_sched.agents.cards import Mode, PolicyCard, check_graph
 from marl_sched.agents.learned.batches import logits_in_blocks
 from marl_sched.agents.learned.checkpoint import load_network
 from marl_sched.agents.learned.network import PolicyNetwork
 from marl_sched.errors import InvalidOptionError
 from marl_sched.graph import ACTION_MASK, STATE, TIME, VISIBLE_SHARE, GraphSpec
 from marl_sched.simulation import TurnSimulator
-
-Mode = Literal["greedy", "sample"]
 
 
 class HetGATPolicy(ObservationScheduler):
@@ -57,15 +55,16 @@ class HetGATPolicy(ObservationScheduler):
         self._checked: GraphSpec | None = None
 
     @classmethod
-    def load(cls, path: str | Path, *, mode: Mode = "greedy", graph: GraphSpec | None = None) -> HetGATPolicy:
+    def load(cls, path: str | Path, *, mode: Mode | None = None, graph: GraphSpec | None = None) -> HetGATPolicy:
         """A policy from its files (marl_sched.agents.learned.checkpoint); its name is the file's.
 
-        Raises InvalidFileError for damaged files, or if the policy was trained on another metagraph than `graph`.
+        `mode` None is its card's. Raises InvalidFileError for damaged files, or if the policy was trained on
+        another metagraph than `graph`.
         """
         network, card = load_network(path)
         if graph is not None:
             check_graph(Path(path).with_suffix(".json"), card, graph)
-        return cls(network, name=Path(path).stem, mode=mode, card=card)
+        return cls(network, name=Path(path).stem, mode=card.mode if mode is None else mode, card=card)
 
     def decide(self, simulator: TurnSimulator) -> np.ndarray:
         """Observe for every acting agent under the simulator's view, then choose.

@@ -50,7 +50,7 @@ def export(
         typer.Option("--length", min=1, help="Simulated time of an episode (default: the environment's)."),
     ] = None,
 ) -> None:
-    """Measure a run's best policy, greedy, on unseen instances of every scale; write its weights and its card."""
+    """Measure a run's best policy on unseen instances of every scale; write its weights and its card."""
     from marl_sched.train.export import export_policy
 
     if not name or Path(name).name != name or "." in name:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from marl_sched.agents import load_policy
 from marl_sched.agents.cards import read_card
 from marl_sched.agents.learned.decima import DecimaNetwork
 from marl_sched.agents.learned.deeprm import DeepRMNetwork
@@ -20,6 +21,7 @@ from marl_sched.files import read_json, write_json
 from marl_sched.train.collect import EpisodeCollector, InstanceSource
 from marl_sched.train.config import HetGATConfig, RunRecord, load_config, load_record
 from marl_sched.train.estimators import StepBaseline
+from marl_sched.train.evaluate import Settings, evaluate_scheduler
 from marl_sched.train.learner import PolicyGradient
 from marl_sched.train.ppo import Ppo, Sampler
 from marl_sched.train.run import resume, train_from_overrides
@@ -141,3 +143,19 @@ def test_a_run_from_before_there_were_other_architectures_is_read(tmp_path: Path
     write_json(tmp_path / "old.json", content)
     assert load_record(tmp_path / "old.json") == load_record(tmp_path / "config.json") == record
     assert isinstance(record.config.policy, HetGATConfig)
+
+
+def test_a_policy_is_played_as_it_was_validated(tmp_path: Path):
+    overrides = ["policy=deeprm", *TINY, "updates=1", "validation.mode=sample"]
+    directory = train_from_overrides([*overrides, f"run_dir={tmp_path}"], quiet=True)
+    path = directory / "policy.safetensors"
+    assert read_card(directory / "policy.json").mode == "sample"
+    assert load_policy(path).mode == "sample"
+    assert load_policy(path, mode="greedy").mode == "greedy"
+    domain, validation = get_domain("airme"), load_config(overrides).validation
+    settings = Settings(episodes=1, seed=validation.seed, horizon=20, scale="small")
+    instances = domain.instances("small", 2, validation.seed)
+    scores = evaluate_scheduler(domain, load_policy(path), instances, settings).measures["profit"]
+    assert read_card(directory / "policy.json").scores["validation"]["M1"] == pytest.approx(scores.mean())
+    greedy = evaluate_scheduler(domain, load_policy(path, mode="greedy"), instances, settings).measures["profit"]
+    assert greedy.mean() != pytest.approx(scores.mean())
