@@ -104,13 +104,14 @@ class Rules(NamedTuple):
 
 
 class Stream(IntEnum):
-    """Streams of AirME's noise; the entity is always the plane's slot."""
+    """Streams of AirME's noise; the entity is the plane's slot, for VIEW which of a view's numbers."""
 
     REPAIR_HOURS = FIRST_DOMAIN_STREAM
     REPAIR_COST = FIRST_DOMAIN_STREAM + 1
     MISSION = FIRST_DOMAIN_STREAM + 2
     MISSION_HOURS = FIRST_DOMAIN_STREAM + 3
     FAILURE = FIRST_DOMAIN_STREAM + 4  # draw = part
+    VIEW = FIRST_DOMAIN_STREAM + 5  # at time 0
 
 
 _REPAIR_HOURS, _REPAIR_COST = int(Stream.REPAIR_HOURS), int(Stream.REPAIR_COST)

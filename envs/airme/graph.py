@@ -66,14 +66,14 @@ class Arrays(NamedTuple):
 
 
 @njit(cache=True)
-def observe(
-    state: State, usage: np.ndarray, agents: np.ndarray, reach: int, comm: int, staleness: int, out: Arrays
-) -> None:
+def observe(state: State, usage: np.ndarray, agents: np.ndarray, limits: np.ndarray, out: Arrays) -> None:
     """Write what each row's agent, int64 (B,), sees; a negative agent sees nothing.
 
-    `usage` float64 (n_types,). `reach`, `comm` and `staleness` are those of a LocalView, or EVERYWHERE.
+    `usage` float64 (n_types,). `limits` int64 (B, 3): each row's reach, comm and staleness, see
+    marl_sched.envs.airme.views.
     """
     for b in range(agents.shape[0]):
+        reach, comm, staleness = limits[b, 0], limits[b, 1], limits[b, 2]
         out.crew[b] = 0
         out.crew_mask[b] = 0
         out.state[b] = 0

@@ -9,7 +9,7 @@ import numpy as np
 from marl_sched.envs.airme import dynamics, graph
 from marl_sched.envs.airme.aircraft import FailureModel, failure_table
 from marl_sched.envs.airme.instance import SCALES, AirmeInstance
-from marl_sched.envs.airme.views import FullView, LocalView
+from marl_sched.envs.airme.views import FullView, View
 from marl_sched.errors import IllegalActionError, InvalidOptionError, require, require_integer
 from marl_sched.noise import as_seed, episode_key
 from marl_sched.simulation import Observation, TurnSimulator
@@ -20,6 +20,8 @@ MOST_HOURS = 1_000_000  # of an episode: books are kept for every hour
 
 class AirmeSimulator(TurnSimulator):
     """A batch of AirME instances, one per row; see TurnSimulator for the turn-taking and its attributes.
+
+    `limits` int64 (B, 3) holds (reach, comm, staleness) of each row's running episode.
 
     Args:
         instances: one AirmeInstance per row, all with the same aircraft types.
@@ -41,7 +43,7 @@ class AirmeSimulator(TurnSimulator):
         self,
         instances: Sequence[AirmeInstance],
         *,
-        view: FullView | LocalView | None = None,
+        view: View | None = None,
         objective: str = "profit",
         horizon: int = DEFAULT_HORIZON,
         seed: int = 0,
@@ -56,14 +58,15 @@ class AirmeSimulator(TurnSimulator):
         self.types = self.instances[0].types
         self.view = view if view is not None else FullView()
         self.objective, self.scheme, self.horizon, self.failure = objective, scheme, horizon, failure
-        self._limits = self.view.limits
         self.batch = len(self.instances)
+        self.limits = np.zeros((self.batch, 3), np.int64)
+        self._no_limits = np.tile(np.array(FullView().limits), (self.batch, 1))
         planes = SCALES[pad].max_planes if pad else max(i.n_planes for i in self.instances)
         crews = SCALES[pad].crews[1] if pad else max(i.n_crews for i in self.instances)
         self.max_targets, self.max_agents = planes + 1, crews
         self.graph = graph.graph_spec(len(self.types))
         self.arrays = self.graph.arrays({"plane": planes + 1, "crew": crews})
-        self.state = _new_state(self.batch, planes, crews, horizon, self._limits[2], record_timeline)
+        self.state = _new_state(self.batch, planes, crews, horizon, self.view.memory, record_timeline)
         self.rules = dynamics.Rules(
             usage=np.array([kind.usage for kind in self.types]),
             failure=np.zeros((len(self.types), 1, 0)),
@@ -161,6 +164,7 @@ class AirmeSimulator(TurnSimulator):
         row["episode"] = episode_key(
             np.uint64(self._seeds[b]), np.uint64(instance.identity), np.uint64(self._episodes[b])
         )
+        self.limits[b] = self.view.limits_in(row["episode"])
         state.series[b] = 0.0
         if len(state.timeline):
             state.timeline[b] = 0
@@ -192,16 +196,16 @@ class AirmeSimulator(TurnSimulator):
 
     def observe(self, agents: np.ndarray, out: Observation | None = None) -> Observation:
         """The graph each row's crew sees under the simulator's view; see TurnSimulator.observe."""
-        return self._observe(agents, self._limits, out)
+        return self._observe(agents, self.limits, out)
 
     def observe_all(self) -> Observation:
         """The acting crews' graphs under the full view."""
-        return self._observe(self.acting, FullView().limits, None)
+        return self._observe(self.acting, self._no_limits, None)
 
-    def _observe(self, agents: np.ndarray, limits: tuple[int, int, int], out: Observation | None) -> Observation:
+    def _observe(self, agents: np.ndarray, limits: np.ndarray, out: Observation | None) -> Observation:
         out = self.new_observation() if out is None else out
         arrays = graph.Arrays(*[out[name] for name in graph.Arrays._fields])
-        graph.observe(self.state, self.rules.usage, np.asarray(agents, np.int64), *limits, arrays)
+        graph.observe(self.state, self.rules.usage, np.asarray(agents, np.int64), limits, arrays)
         return out
 
     def free_agents(self, row: int) -> np.ndarray:

@@ -146,7 +146,7 @@ class AirmeTelemetry:
 
     def frame(self, simulator: AirmeSimulator) -> bytes:
         """Sizes, padding, usage and view of row 0."""
-        reach, comm, staleness = (min(limit, EVERYWHERE) for limit in simulator.view.limits)
+        reach, comm, staleness = simulator.limits[0].tolist()
         row = simulator.state.rows[0]
         return _encode(
             Frame(
@@ -163,7 +163,7 @@ class AirmeTelemetry:
 
     def messages(self, simulator: AirmeSimulator) -> dict[str, bytes]:
         """Every sector now and delayed, every crew's status and memory."""
-        state, staleness = simulator.state, simulator.view.limits[2]
+        state, staleness = simulator.state, int(simulator.limits[0, 2])
         n_planes, n_crews = int(state.rows[0]["n_planes"]), int(state.rows[0]["n_crews"])
         now = int(state.rows[0]["time"])
         pictured = max(0, now - staleness)
@@ -173,7 +173,7 @@ class AirmeTelemetry:
             planes = _statuses(state.planes[0], slots, with_chosen=False)
             said[f"plane/{sector}/now"] = _encode(Sector(hour=now, planes=planes))
             if staleness:
-                planes = _statuses(state.past[0, pictured % (staleness + 1)], slots, with_chosen=False)
+                planes = _statuses(state.past[0, pictured % state.past.shape[1]], slots, with_chosen=False)
                 said[f"plane/{sector}/delayed"] = _encode(Sector(hour=pictured, planes=planes))
         for crew in range(n_crews):
             record = {name: int(state.crews[0, crew][name]) for name in CREW.names or ()}
@@ -219,6 +219,7 @@ class AirmeBelief:
         channels += [f"crew/{crew}/status" for crew in self._crews]
         channels += [f"crew/{agent}/told"] if frame.staleness else []
         self.channels = tuple(sorted(channels))
+        self._limits = np.array([[frame.reach, frame.comm, frame.staleness]])
         self._state = _empty_state(frame)
         sizes = {"plane": frame.max_planes + 1, "crew": frame.max_crews}
         arrays = graph.graph_spec(len(frame.usage)).arrays(sizes)
@@ -270,9 +271,9 @@ class AirmeBelief:
 
     def observe(self) -> Observation:
         """The crew's observation; its arrays are written anew by every call."""
-        frame, out = self._frame, graph.Arrays(*[self._observation[name] for name in graph.Arrays._fields])
+        out = graph.Arrays(*[self._observation[name] for name in graph.Arrays._fields])
         agents = np.array([self._agent], np.int64)
-        graph.observe(self._state, self._usage, agents, frame.reach, frame.comm, frame.staleness, out)
+        graph.observe(self._state, self._usage, agents, self._limits, out)
         return self._observation
 
 

@@ -1,18 +1,26 @@
 """What a crew sees of an AirME problem: everything, or its neighbourhood on the ring of crews.
 
 Crews stand on a ring. The home sector of the plane in slot s is crew (s - 1) mod n_crews.
+
+What a view lets a crew see in an episode comes down to three numbers, its limits: (reach, comm, staleness).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from numbers import Real
 
+import numpy as np
 from numba import njit
 
-from marl_sched.errors import require_integer
+from marl_sched.envs.airme.dynamics import Stream
+from marl_sched.errors import InvalidOptionError, require_integer
+from marl_sched.noise import integer, moment_key, uniform
 
 EVERYWHERE = 1 << 30
 MOST_STALENESS = 8760  # hours: a year, of which a simulator keeps a picture an hour
+
+Limits = tuple[int, int, int]  # reach, comm, staleness
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,9 +30,18 @@ class FullView:
     kind = "full"
 
     @property
-    def limits(self) -> tuple[int, int, int]:
-        """(reach, comm, staleness) as the kernels take them."""
+    def limits(self) -> Limits:
+        """Those of all episodes."""
         return EVERYWHERE, EVERYWHERE, 0
+
+    def limits_in(self, episode: np.uint64) -> Limits:
+        """Those of the episode with that key of its noise."""
+        return self.limits
+
+    @property
+    def memory(self) -> int:
+        """How many hours back a picture may be asked for."""
+        return 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,12 +66,66 @@ class LocalView:
             object.__setattr__(self, name, require_integer(f"view local: {name}", getattr(self, name), 0, most))
 
     @property
-    def limits(self) -> tuple[int, int, int]:
-        """(reach, comm, staleness) as the kernels take them."""
+    def limits(self) -> Limits:
+        """Those of all episodes."""
         return self.reach, self.comm, self.staleness
 
+    def limits_in(self, episode: np.uint64) -> Limits:
+        """Those of the episode with that key of its noise."""
+        return self.limits
 
-VIEWS: dict[str, type] = {"full": FullView, "local": LocalView}
+    @property
+    def memory(self) -> int:
+        """How many hours back a picture may be asked for."""
+        return self.staleness
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomView:
+    """In every episode another local view, so that one policy learns to serve them all.
+
+    Reach and comm are integers uniform on [0, reach_most] and [0, comm_most]; a share `fresh_share` of the
+    episodes has no staleness, in the others it is uniform on [0, staleness_most] hours. The numbers follow from the
+    key of an episode's noise, so all schedulers that are compared meet the same views, a run that is resumed goes on
+    with the same ones, and a deployed world tells its agents those of its episode.
+    Raises InvalidOptionError for an option that is no number of its range.
+    """
+
+    kind = "random"
+
+    reach_most: int = 3
+    comm_most: int = 3
+    staleness_most: int = 24  # hours
+    fresh_share: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Bring the options to plain numbers and refuse those outside their range."""
+        bounds = {"reach_most": EVERYWHERE, "comm_most": EVERYWHERE, "staleness_most": MOST_STALENESS}
+        for name, most in bounds.items():
+            object.__setattr__(self, name, require_integer(f"view random: {name}", getattr(self, name), 0, most))
+        fresh = self.fresh_share
+        if isinstance(fresh, bool) or not isinstance(fresh, Real) or not 0.0 <= fresh <= 1.0:
+            raise InvalidOptionError(f"view random: fresh_share: expected a share in [0, 1], got {fresh!r}")
+        object.__setattr__(self, "fresh_share", float(fresh))
+
+    def limits_in(self, episode: np.uint64) -> Limits:
+        """Those of the episode with that key of its noise."""
+        moment = np.uint64(moment_key(episode, 0))
+        reach, comm, fresh, staleness = (uniform(moment, int(Stream.VIEW), which, 0) for which in range(4))
+        return (
+            integer(reach, 0, self.reach_most),
+            integer(comm, 0, self.comm_most),
+            0 if fresh < self.fresh_share else integer(staleness, 0, self.staleness_most),
+        )
+
+    @property
+    def memory(self) -> int:
+        """How many hours back a picture may be asked for."""
+        return self.staleness_most
+
+
+View = FullView | LocalView | RandomView
+VIEWS: dict[str, type] = {"full": FullView, "local": LocalView, "random": RandomView}
 
 
 @njit(cache=True, inline="always")

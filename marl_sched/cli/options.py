@@ -18,7 +18,7 @@ Env = Annotated[str, typer.Option("--env", help="The environment; `marl-sched li
 Scale = Annotated[str, typer.Option("--scale", help="Size of generated instances.")]
 Seed = Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="Seed of instances and noise.")]
 Hours = Annotated[int | None, typer.Option("--hours", min=1, help="airme: hours of an episode (default 720).")]
-View = Annotated[str, typer.Option("--view", help="What an acting agent sees: full or local.")]
+View = Annotated[str, typer.Option("--view", help="What an acting agent sees: full, local or (airme) random.")]
 Reach = Annotated[
     int | None, typer.Option("--reach", metavar="R", help="view local: sectors seen either side (default 1).")
 ]

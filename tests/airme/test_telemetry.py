@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from marl_sched.domain import get_domain
 from marl_sched.envs.airme.simulator import AirmeSimulator
-from marl_sched.envs.airme.views import FullView, LocalView
+from marl_sched.envs.airme.views import FullView, LocalView, RandomView
 from marl_sched.errors import InvalidMessageError
 
 AIRME = get_domain("airme")
@@ -21,6 +21,7 @@ VIEWS = [
     LocalView(reach=0, comm=0, staleness=12),
     LocalView(reach=2, comm=1, staleness=12),
     LocalView(reach=1, comm=3, staleness=3),
+    RandomView(reach_most=2, comm_most=2, staleness_most=12, fresh_share=0.3),
 ]
 
 
