@@ -7,7 +7,9 @@ INSTALLED := .venv/.installed
 WHEEL_VENV := build/wheel-venv
 PYTEST_ARGS ?=
 
-.PHONY: demo test unit wheel lint format clean
+WORKERS ?= 2
+
+.PHONY: demo test unit wheel lint tables-airme format clean
 
 demo: $(INSTALLED) ## seven crews as processes for thirty days, compared with central schedulers; writes out/demo/
 	$(BIN)/marl-sched demo
@@ -37,6 +39,9 @@ lint: $(INSTALLED) ## style, formatting, types
 	rm -rf build
 	$(BIN)/python -m pip install --quiet --no-deps --target build/typecheck .
 	cd build/typecheck && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache -p marl_sched
+
+tables-airme: $(INSTALLED) ## tables 6.2 to 6.4 in docs/results/, only the cells that are missing; QUICK=1: a look, in out/tables/
+	$(BIN)/marl-sched tables --env airme --workers $(WORKERS) $(if $(QUICK),--quick)
 
 format: $(INSTALLED) ## sort imports and lay out the code
 	$(BIN)/ruff check --select I --fix .

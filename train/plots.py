@@ -143,3 +143,40 @@ def _plain(axes: Axes) -> None:
     axes.spines[["top", "right"]].set_visible(False)
     axes.set_axisbelow(True)
     axes.tick_params(labelsize=9)
+
+
+def shares_against_scores(panels: Mapping[str, Mapping[str, Any]], *, measure: str = "M1") -> Figure:
+    """M1 against the share of the graph that an agent sees: a panel per caption, a line per scheduler.
+
+    A panel is `{"bound": float, "central": (label, float), "lines": {label: [(share, score, stale), ...]}}`; points
+    of old data (`stale`) are open and stand beside the line. A scheduler has the same colour and shape everywhere;
+    the bound and the score of the best scheduler that sees everything are level lines.
+    """
+    labels = list(dict.fromkeys(label for panel in panels.values() for label in panel["lines"]))
+    looks = {label: (_LINES[i % len(_LINES)], "osD^vP"[i % 6]) for i, label in enumerate(labels)}
+    figure = Figure(figsize=(1.5 + 4.6 * len(panels), 5.6), layout="constrained")
+    all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    for axes, (caption, panel) in zip(all_axes, panels.items(), strict=True):
+        for label, points in panel["lines"].items():
+            colour, marker = looks[label]
+            fresh = sorted((100 * share, score) for share, score, stale in points if not stale)
+            old = [(100 * share, score) for share, score, stale in points if stale]
+            for xy, look in ((fresh, {"ls": "-", "ms": 5}), (old, {"ls": "none", "ms": 6.5, "mfc": "white"})):
+                axes.plot([x for x, _ in xy], [y for _, y in xy], color=colour, marker=marker, lw=1.5, **look)
+        name, best = panel["central"]
+        axes.axhline(panel["bound"], color=_INK, lw=1.3)
+        axes.axhline(best, color=_INK, lw=1.1, ls=":")
+        axes.set_title(f"{caption}\nbound {panel['bound']:.4f}, central {name} {best:.4f}", fontsize=10, loc="left")
+        axes.set_xlabel("share of the graph that an acting agent sees, percent")
+        axes.set_xlim(0, 104)
+        _plain(axes)
+        axes.grid(color=_FAINT, lw=0.6)
+    all_axes[0].set_ylabel(measure)
+    handles = [Line2D([], [], color=colour, marker=marker, label=label) for label, (colour, marker) in looks.items()]
+    handles += [
+        Line2D([], [], color=_INK, marker="o", mfc="white", ls="none", label="open: others' sectors seen late"),
+        Line2D([], [], color=_INK, lw=1.3, label="upper bound"),
+        Line2D([], [], color=_INK, lw=1.1, ls=":", label="best that sees everything"),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    return figure

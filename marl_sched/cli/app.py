@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from marl_sched.cli import bound, demo, deployment, evaluation, information, problems, training
+from marl_sched.cli import bound, demo, deployment, evaluation, information, pages, problems, training
 from marl_sched.errors import MarlSchedError
 
 app = typer.Typer(
@@ -19,7 +19,7 @@ app = typer.Typer(
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
 )
-for group in (problems, evaluation, bound, training, deployment, demo, information):
+for group in (problems, evaluation, pages, bound, training, deployment, demo, information):
     group.add_to(app)
 
 # Newer typer ships click inside itself, older ones depend on it: the base of all its errors of usage is reached

@@ -1,0 +1,96 @@
+"""`marl-sched tables`: the published tables made again, cell by cell."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from marl_sched.cli import options
+
+if TYPE_CHECKING:
+    from marl_sched.train.tables.cells import Cells, Job
+    from marl_sched.train.tables.entries import Untrained
+
+FOLDER, QUICK_FOLDER = Path("docs/results"), Path("out/tables")
+UNTRAINED = 3  # exit code when the page is made, but lacks policies
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register this file's commands."""
+    app.command(epilog="Example: marl-sched tables --env airme --quick --workers 2")(tables)
+
+
+def tables(
+    env: options.Env = "airme",
+    quick: Annotated[bool, typer.Option("--quick", help="Few instances and episodes, in a folder of its own.")] = False,
+    render: Annotated[bool, typer.Option("--render", help="Only draw the page; play nothing.")] = False,
+    without_policies: Annotated[
+        bool, typer.Option("--without-policies", help="Only make the cells of rules and bounds; draw no page.")
+    ] = False,
+    workers: Annotated[int, typer.Option("--workers", min=1, help="Processes that play, one thread each.")] = 1,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="DIR", help=f"Folder (default {FOLDER}, with --quick {QUICK_FOLDER})."),
+    ] = None,
+) -> None:
+    """Make the published tables again: play the cells that are missing, then draw the page from all cells.
+
+    Run it at the root of a checkout. It can be stopped and started again; finished cells are kept. Ends with 3 if
+    policies of the list are not trained yet; the page names them.
+    """
+    from marl_sched.train.tables.cells import Cells
+    from marl_sched.train.tables.entries import Entries
+    from marl_sched.train.tables.filling import missing
+    from marl_sched.train.tables.page import write_pages
+    from marl_sched.train.tables.plan import load_plan
+
+    out = out or (QUICK_FOLDER if quick else FOLDER)
+    options.check_folder(out)
+    plan = load_plan(env)
+    entries = Entries(plan, plan.quick if quick else plan.full, Path())
+    jobs, untrained = entries.all()
+    cells = Cells(out / env)
+    if not render:
+        chosen = [job for job in jobs if job.weights is None] if without_policies else jobs
+        _fill(missing(chosen, cells), cells, workers)
+    if not without_policies:
+        command = f"marl-sched tables --env {env}" + (" --quick" if quick else "")
+        for path in write_pages(entries, cells, command, out):
+            typer.echo(path)
+    _tell(untrained)
+
+
+def _fill(jobs: list[Job], cells: Cells, workers: int) -> None:
+    """Make cells, with a bar where there is a terminal and a line for each that is finished."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from marl_sched.train.tables.cells import describe
+    from marl_sched.train.tables.filling import fill, worker_processes
+
+    if not jobs:
+        return
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        work = progress.add_task("cells", total=len(jobs))
+        with worker_processes(min(workers, len(jobs))) as pool:
+            for done, (job, cell) in enumerate(fill(jobs, cells, pool), start=1):
+                score = sum(cell.M1) / len(cell.M1)
+                console.print(
+                    f"{done}/{len(jobs)} {describe(job.inputs)}: M1 {score:.4f}, {cell.seconds:.0f} s",
+                    highlight=False,
+                    soft_wrap=True,
+                )
+                progress.update(work, completed=done)
+
+
+def _tell(untrained: list[Untrained]) -> None:
+    """Name the policies that are not there, and end with an exit code that says so if there are any."""
+    for entry in untrained:
+        how = f": {entry.command}" if entry.command else ""
+        typer.echo(f"not trained yet: {entry.policy} ({entry.label}){how}", err=True)
+    if untrained:
+        raise typer.Exit(UNTRAINED)

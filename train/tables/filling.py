@@ -1,0 +1,53 @@
+"""Making the cells that are not there yet, in worker processes, cheapest first.
+
+A cell is written when it is finished, so whatever stops the work costs no more than the cells in the making.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from importlib.util import find_spec
+
+from marl_sched.train.tables.cells import Cell, Cells, Job, make
+
+
+def missing(jobs: Iterable[Job], cells: Cells) -> list[Job]:
+    """The jobs whose cells are not there yet, in their order; InvalidFileError for a damaged cell."""
+    return [job for job in jobs if cells.read(job.inputs) is None]
+
+
+def fill(jobs: Iterable[Job], cells: Cells, pool: Executor) -> Iterator[tuple[Job, Cell]]:
+    """Make each job's cell and keep it; yields them as they are finished."""
+    futures = {pool.submit(make, job): job for job in jobs}
+    for future in as_completed(futures):
+        cell = future.result()
+        cells.write(cell)
+        yield futures[future], cell
+
+
+@contextmanager
+def worker_processes(workers: int) -> Iterator[Executor]:
+    """A pool of single-threaded processes, which are gone when the block is left, also by Ctrl-C or an error."""
+    others = set(multiprocessing.active_children())
+    context = multiprocessing.get_context("spawn")  # PyTorch and Numba do not survive a fork with threads
+    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_begin_work)
+    try:
+        yield pool
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in set(multiprocessing.active_children()) - others:
+            process.terminate()
+        raise
+    pool.shutdown()
+
+
+def _begin_work() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process; the parent ends the workers
+    if find_spec("torch") is not None:
+        import torch
+
+        torch.set_num_threads(1)
