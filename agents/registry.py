@@ -20,7 +20,7 @@ from marl_sched.domain import Domain
 from marl_sched.errors import InvalidFileError, MarlSchedError, UnknownNameError
 
 if TYPE_CHECKING:
-    from marl_sched.agents.hetgat.policy import HetGATPolicy
+    from marl_sched.agents.learned.policy import NetworkPolicy
     from marl_sched.graph import GraphSpec
 
 SHIPPED = Path(__file__).resolve().parent / "shipped"
@@ -74,7 +74,7 @@ def create_scheduler(name_or_path: str | Path, domain: Domain | str, **options: 
     return policy
 
 
-def load_policy(name_or_path: str | Path, *, mode: Mode | None = None, graph: GraphSpec | None = None) -> HetGATPolicy:
+def load_policy(name_or_path: str | Path, *, mode: Mode | None = None, graph: GraphSpec | None = None) -> NetworkPolicy:
     """A trained policy by its shipped name, or by the path of its weights or its card.
 
     `mode` is `greedy` or `sample`, None: as its card says. With a `graph` a policy that was trained on another
@@ -83,14 +83,14 @@ def load_policy(name_or_path: str | Path, *, mode: Mode | None = None, graph: Gr
     """
     path = policy_path(name_or_path)
     try:
-        from marl_sched.agents.hetgat.policy import HetGATPolicy
+        from marl_sched.agents.learned.policy import NetworkPolicy
     except ModuleNotFoundError as error:
         if error.name not in ("torch", "safetensors"):
             raise
         raise MarlSchedError(
             f"policy {name_or_path}: expected {error.name} to be installed: pip install 'marl-sched[train]'"
         ) from error
-    return HetGATPolicy.load(path, mode=mode, graph=graph)
+    return NetworkPolicy.load(path, mode=mode, graph=graph)
 
 
 def policy_path(name_or_path: str | Path) -> Path:

@@ -15,7 +15,7 @@ import torch
 
 from marl_sched.agents.benchmark import own_benchmarks
 from marl_sched.agents.hetgat.network import HetGATNetwork
-from marl_sched.agents.hetgat.policy import HetGATPolicy
+from marl_sched.agents.learned.policy import NetworkPolicy
 from marl_sched.domain import Domain
 from marl_sched.envs.aec import SchedulingAEC
 from marl_sched.envs.torchrl_env import SchedulingTorchRL
@@ -97,7 +97,7 @@ def policy_milliseconds(domain: Domain, scale: str, repeats: int) -> float:
     simulator: TurnSimulator = domain.simulator(domain.instances(scale, 1, 0), pad=scale)
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        policy = HetGATPolicy(HetGATNetwork(simulator.graph))
+        policy = NetworkPolicy(HetGATNetwork(simulator.graph))
 
     def play() -> None:
         for _ in range(_POLICY_DECISIONS):

@@ -8,9 +8,9 @@ from pathlib import Path
 import msgspec
 
 from marl_sched.agents.cards import PolicyCard, read_card
-from marl_sched.agents.hetgat.policy import HetGATPolicy
 from marl_sched.agents.learned.checkpoint import load_network, save_network
 from marl_sched.agents.learned.network import PolicyNetwork, slots_of
+from marl_sched.agents.learned.policy import NetworkPolicy
 from marl_sched.agents.registry import create_scheduler, policy_path
 from marl_sched.domain import Domain, get_domain
 from marl_sched.train.config import GaeConfig, ImitationConfig, RunRecord, TrainConfig
@@ -89,7 +89,7 @@ def export_policy(
         settings = Settings(
             episodes=episodes, seed=seed, view=view, objective=card.objective, horizon=length, scale=scale
         )
-        policy = HetGATPolicy(network, mode=card.mode)
+        policy = NetworkPolicy(network, mode=card.mode)
         scores = evaluate_scheduler(domain, policy, domain.instances(scale, instances, seed), settings)
         means = scores.measures[card.objective].mean(axis=1)
         measured[scale] = {

@@ -11,9 +11,9 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from marl_sched.agents.hetgat.network import HetGATCritic
-from marl_sched.agents.hetgat.policy import inverse_distribution
 from marl_sched.agents.learned.compaction import compacted
 from marl_sched.agents.learned.network import PolicyNetwork
+from marl_sched.agents.learned.policy import inverse_distribution
 from marl_sched.graph import ACTION_MASK
 from marl_sched.train.advantages import normalised
 from marl_sched.train.collect import Rollout

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from marl_sched.agents.hetgat.policy import HetGATPolicy
 from marl_sched.agents.learned.network import PolicyNetwork
+from marl_sched.agents.learned.policy import NetworkPolicy
 from marl_sched.domain import Domain, get_domain
 from marl_sched.train.config import TrainConfig
 from marl_sched.train.evaluate import Settings, evaluate_scheduler
@@ -29,6 +29,6 @@ class Validation:
 
     def __call__(self, network: PolicyNetwork) -> float:
         """M1, the mean over instances and episodes."""
-        policy = HetGATPolicy(network, mode=self._mode)
+        policy = NetworkPolicy(network, mode=self._mode)
         scores = evaluate_scheduler(self._domain, policy, self._instances, self._settings)
         return float(scores.measures[str(self._settings.objective)].mean())

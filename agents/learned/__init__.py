@@ -1,4 +1,5 @@
-"""Learned policies whatever their architecture: what a network must offer, and two published ones beside HetGAT.
+"""Learned policies whatever their architecture: what a network must offer, how it decides, how it is kept in files.
 
-Importing this package needs torch; `marl_sched.agents` imports it only when a policy is loaded.
+Decima and DeepRM are here too; HetGAT, which is larger, has a package of its own. Importing this package needs torch;
+`marl_sched.agents` imports it only when a policy is loaded.
 """

@@ -13,8 +13,8 @@ import torch
 
 from marl_sched.agents.cards import PolicyCard, check_graph, read_card, source_revision
 from marl_sched.agents.hetgat.network import HetGATNetwork
-from marl_sched.agents.hetgat.policy import HetGATPolicy
 from marl_sched.agents.learned.checkpoint import load_network, save_network
+from marl_sched.agents.learned.policy import NetworkPolicy
 from marl_sched.agents.registry import create_scheduler
 from marl_sched.domain import domain_names, get_domain
 from marl_sched.errors import InvalidFileError
@@ -55,7 +55,7 @@ def test_a_checkpoint_comes_back_as_it_was(network, saved, sizes, observe):
         assert torch.equal(again(observation), network(observation))
         assert msgspec.structs.replace(card, weights_sha256="") == card_of(network)
         assert again.spec == network.spec
-    policy = HetGATPolicy.load(saved, graph=network.spec)
+    policy = NetworkPolicy.load(saved, graph=network.spec)
     assert policy.name == "mine"
     assert policy.choose({name: v.numpy() for name, v in observation.items()}, np.zeros(3)).shape == (3,)
 
@@ -233,13 +233,13 @@ def test_a_policy_for_other_features_is_refused_by_name(network, saved):
         network.spec, nodes=(NodeType(first.name, ("rust", *first.features[1:])), *network.spec.nodes[1:])
     )
     with pytest.raises(InvalidFileError, match=rf"features of '{first.name}': .*lacks \['rust'\]"):
-        HetGATPolicy.load(saved, graph=renamed)
+        NetworkPolicy.load(saved, graph=renamed)
 
 
 def test_a_policy_for_other_relations_is_refused(network, saved):
     fewer = replace(network.spec, relations=network.spec.relations[1:])
     with pytest.raises(InvalidFileError, match="relations: expected those of the environment's graph"):
-        HetGATPolicy.load(saved, graph=fewer)
+        NetworkPolicy.load(saved, graph=fewer)
     check_graph(saved, read_card(saved.with_suffix(".json")), network.spec)
 
 
@@ -250,4 +250,4 @@ def test_a_policy_of_another_domain_is_refused_by_its_card(saved):
     murse = get_domain("murse")
     simulator = murse.simulator(murse.instances("small", 1, 0))
     with pytest.raises(InvalidFileError, match=r"^mine\.json: "):
-        HetGATPolicy.load(saved).decide(simulator)
+        NetworkPolicy.load(saved).decide(simulator)

@@ -11,12 +11,12 @@ from torch import Tensor, nn
 
 from marl_sched.agents.cards import DecimaSizes, DeepRMSizes, HetGATSizes, PolicyCard
 from marl_sched.agents.hetgat.network import HetGATNetwork
-from marl_sched.agents.hetgat.policy import HetGATPolicy
 from marl_sched.agents.learned.architectures import new_network
 from marl_sched.agents.learned.checkpoint import load_network, save_network
 from marl_sched.agents.learned.decima import DecimaNetwork
 from marl_sched.agents.learned.deeprm import DeepRMNetwork
 from marl_sched.agents.learned.network import PolicyNetwork
+from marl_sched.agents.learned.policy import NetworkPolicy
 from marl_sched.domain import domain_names, get_domain
 from marl_sched.errors import InvalidFileError, InvalidOptionError
 from marl_sched.files import read_json, write_json
@@ -153,7 +153,7 @@ def test_permuting_planes_permutes_decimas_decisions_and_empty_slots_change_noth
 
 @pytest.mark.parametrize("sizes", [{"plane": 10, "crew": 4}, {"plane": 9, "crew": 3}])
 def test_deeprm_refuses_other_sizes_and_names_both(sizes: dict[str, int], fleet, observe):
-    policy = HetGATPolicy(made("deeprm", fleet, {"plane": 9, "crew": 4}))
+    policy = NetworkPolicy(made("deeprm", fleet, {"plane": 9, "crew": 4}))
     message = f"slots 9 plane, 4 crew cannot read one with {sizes['plane']} plane, {sizes['crew']} crew"
     with pytest.raises(InvalidOptionError, match=re.escape(message)):
         policy.choose(arrays(observe(fleet, sizes)), np.zeros(3))
@@ -181,7 +181,7 @@ def test_a_published_policy_comes_back_from_its_files_and_plays_every_domain(nam
     assert type(again) is PUBLISHED[name]
     assert read.sizes == network.sizes
     assert read_json(path.with_suffix(".json"))["sizes"]["architecture"] == name
-    policy, loaded = HetGATPolicy(network), HetGATPolicy.load(path, graph=simulator.graph)
+    policy, loaded = NetworkPolicy(network), NetworkPolicy.load(path, graph=simulator.graph)
     for _ in range(20):
         choice = policy.decide(simulator)
         assert (loaded.decide(simulator) == choice).all()

@@ -8,7 +8,7 @@ import torch
 from scipy.stats import chisquare
 
 from marl_sched.agents.hetgat.network import HetGATNetwork
-from marl_sched.agents.hetgat.policy import HetGATPolicy, inverse_distribution
+from marl_sched.agents.learned.policy import NetworkPolicy, inverse_distribution
 from marl_sched.domain import get_domain
 from marl_sched.errors import InvalidOptionError
 from marl_sched.graph import ACTION_MASK
@@ -35,7 +35,7 @@ def row_of(observation, b: int) -> dict[str, np.ndarray]:
 
 
 def test_greedy_takes_the_most_probable_legal_target(network, observation):
-    policy = HetGATPolicy(network)
+    policy = NetworkPolicy(network)
     targets = policy.choose(observation, np.zeros(7))
     assert targets.dtype == np.int64
     assert (observation[ACTION_MASK][np.arange(7), targets] == 1).all()
@@ -44,11 +44,11 @@ def test_greedy_takes_the_most_probable_legal_target(network, observation):
 
 def test_greedy_ties_go_to_the_lowest_index(network, observation):
     torch.nn.init.zeros_(network.readout.weight)
-    assert (HetGATPolicy(network).choose(observation, np.full(7, 0.9)) == 0).all()
+    assert (NetworkPolicy(network).choose(observation, np.full(7, 0.9)) == 0).all()
 
 
 def test_sampling_follows_the_distribution(network, observation):
-    policy = HetGATPolicy(network, mode="sample")
+    policy = NetworkPolicy(network, mode="sample")
     count = 20_000
     many = {name: np.repeat(values[:1], count, axis=0) for name, values in observation.items()}
     picks = policy.choose(many, np.random.default_rng(0).random(count))
@@ -66,7 +66,7 @@ def row_as_batch(observation, b: int) -> dict[str, np.ndarray]:
 
 
 def test_sampling_is_a_function_of_observation_and_uniform(network, observation):
-    policy, again = HetGATPolicy(network, mode="sample"), HetGATPolicy(network, mode="sample")
+    policy, again = NetworkPolicy(network, mode="sample"), NetworkPolicy(network, mode="sample")
     uniform = np.linspace(0.0, 0.999, 7)
     first = policy.choose(observation, uniform)
     torch.rand(5)
@@ -83,7 +83,7 @@ def test_inverse_distribution_by_hand(uniform: float, target: int):
 
 
 def test_one_agent_chooses_what_it_would_choose_in_a_batch_of_one(network, observation):
-    policy = HetGATPolicy(network, mode="sample")
+    policy = NetworkPolicy(network, mode="sample")
     for b in range(7):
         row = row_of(observation, b)
         mask = row.pop(ACTION_MASK)
@@ -94,7 +94,7 @@ def test_one_agent_chooses_what_it_would_choose_in_a_batch_of_one(network, obser
 
 
 def test_a_single_decision_is_bit_equal_when_it_is_repeated(network, observation):
-    policy = HetGATPolicy(network)
+    policy = NetworkPolicy(network)
     first = policy.logits(row_as_batch(observation, 2))
     for _ in range(20):
         assert (policy.logits(row_as_batch(observation, 2)) == first).all()
@@ -105,12 +105,12 @@ def test_a_single_decision_is_bit_equal_when_it_is_repeated(network, observation
 def test_read_only_arrays_as_a_message_holds_them_are_accepted(network, observation):
     frozen = {name: np.frombuffer(v.tobytes(), v.dtype).reshape(v.shape) for name, v in observation.items()}
     assert not frozen["plane"].flags.writeable
-    policy = HetGATPolicy(network)
+    policy = NetworkPolicy(network)
     assert (policy.choose(frozen, np.zeros(7)) == policy.choose(observation, np.zeros(7))).all()
 
 
 def test_a_policy_keeps_the_weights_it_was_made_with(network, observation):
-    policy = HetGATPolicy(network)
+    policy = NetworkPolicy(network)
     before = policy.logits(observation)
     with torch.no_grad():
         for parameter in network.parameters():
@@ -120,26 +120,26 @@ def test_a_policy_keeps_the_weights_it_was_made_with(network, observation):
 
 def test_an_observation_of_another_graph_is_refused(network, observation):
     observation["plane"] = observation["plane"][..., :-1]
-    with pytest.raises(InvalidOptionError, match=r"plane: policy hetgat expects 5 features, got shape \(7, 9, 4\)"):
-        HetGATPolicy(network).choose(observation, np.zeros(7))
+    with pytest.raises(InvalidOptionError, match=r"plane: policy unsaved expects 5 features, got shape \(7, 9, 4\)"):
+        NetworkPolicy(network).choose(observation, np.zeros(7))
 
 
 def test_a_missing_array_is_refused(network, observation):
     del observation["state"]
-    with pytest.raises(InvalidOptionError, match="observation: state: policy hetgat expects 4 features"):
-        HetGATPolicy(network).choose(observation, np.zeros(7))
+    with pytest.raises(InvalidOptionError, match="observation: state: policy unsaved expects 4 features"):
+        NetworkPolicy(network).choose(observation, np.zeros(7))
 
 
 def test_an_unknown_mode_is_refused(network):
     with pytest.raises(InvalidOptionError, match="expected one of greedy, sample, got 'warm'"):
-        HetGATPolicy(network, mode="warm")
+        NetworkPolicy(network, mode="warm")
 
 
 def test_rows_that_are_over_get_0_and_change_no_other_choice():
     domain = get_domain("airme")
     simulator = domain.simulator(domain.instances("small", 4, 0), horizon=3, pad="small")
     torch.manual_seed(0)
-    policy = HetGATPolicy(HetGATNetwork(simulator.graph), mode="sample")
+    policy = NetworkPolicy(HetGATNetwork(simulator.graph), mode="sample")
     while simulator.over.sum() < 2:
         simulator.step(policy.decide(simulator))
     acting = simulator.acting >= 0

@@ -12,8 +12,8 @@ import torch
 from marl_sched.agents import create_scheduler, load_policy, registry, scheduler_names
 from marl_sched.agents.cards import PolicyCard
 from marl_sched.agents.hetgat.network import HetGATNetwork
-from marl_sched.agents.hetgat.policy import HetGATPolicy
 from marl_sched.agents.learned.checkpoint import save_network
+from marl_sched.agents.learned.policy import NetworkPolicy
 from marl_sched.envs.airme.graph import graph_spec
 from marl_sched.errors import InvalidFileError, InvalidOptionError, UnknownNameError
 
@@ -70,7 +70,7 @@ def test_a_shipped_policy_is_found_by_its_name_in_its_own_domain_only(shipped):
     assert scheduler_names("airme")[-1] == "mine"
     assert "mine" not in scheduler_names("murse")
     policy = create_scheduler("mine", "airme", mode="sample")
-    assert isinstance(policy, HetGATPolicy)
+    assert isinstance(policy, NetworkPolicy)
     assert (policy.name, policy.mode) == ("mine", "sample")
     assert load_policy("mine").card == policy.card
     with pytest.raises(UnknownNameError, match="unknown scheduler 'mine'"):

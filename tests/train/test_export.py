@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from marl_sched.agents.cards import read_card
-from marl_sched.agents.hetgat.policy import HetGATPolicy
+from marl_sched.agents.learned.policy import NetworkPolicy
 from marl_sched.cli.app import run as run_command
 from marl_sched.domain import get_domain
 from marl_sched.envs.airme.views import LocalView
@@ -26,7 +26,7 @@ def test_the_card_holds_what_an_evaluation_with_that_seed_measures(tmp_path: Pat
     )
     settings = Settings(episodes=2, seed=5, view=LocalView(), objective="profit", horizon=20, scale="small")
     domain = get_domain("airme")
-    policy = HetGATPolicy.load(tmp_path / "mine.safetensors")
+    policy = NetworkPolicy.load(tmp_path / "mine.safetensors")
     scores = evaluate_scheduler(domain, policy, domain.instances("small", 2, 5), settings)
     assert card.scores["small"]["M1"] == pytest.approx(scores.measures["profit"].mean())
     assert card.scores["small"]["visible_share"] == pytest.approx(scores.visible_share)
@@ -46,7 +46,7 @@ def test_the_command_writes_a_policy_with_scores_of_every_scale(tmp_path: Path, 
         assert (measured["instances"], measured["episodes"], measured["seed"]) == (1, 1, 5)
         assert f"{scale}: M1 {measured['M1']:.4f}" in told
     assert card.git_hash == read_card(run / "policy.json").git_hash
-    assert HetGATPolicy.load(tmp_path / "out" / "mine.safetensors").name == "mine"
+    assert NetworkPolicy.load(tmp_path / "out" / "mine.safetensors").name == "mine"
 
 
 @pytest.mark.parametrize("name", ["a/b", "mine.json", "", ".."])

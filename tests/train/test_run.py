@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from safetensors.torch import load_file
 
-from marl_sched.agents.hetgat.policy import HetGATPolicy
+from marl_sched.agents.learned.policy import NetworkPolicy
 from marl_sched.errors import InvalidFileError, InvalidOptionError
 from marl_sched.files import read_json
 from marl_sched.train.config import RunRecord, load_config
@@ -109,7 +109,7 @@ def test_the_best_policy_is_kept_with_a_card_that_says_how_it_was_made(tmp_path:
     assert card["training_knowledge"] == "a critic on the full graph"
     scores = [float(row["validation"]) for row in rows(directory) if row["validation"]]
     assert card["scores"]["validation"]["M1"] == pytest.approx(max(scores), abs=1e-6)
-    assert HetGATPolicy.load(directory / "policy.safetensors").card is not None
+    assert NetworkPolicy.load(directory / "policy.safetensors").card is not None
 
 
 def test_every_update_is_logged_as_csv_and_for_tensorboard(tmp_path: Path):

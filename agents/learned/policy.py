@@ -21,8 +21,8 @@ from marl_sched.graph import ACTION_MASK, STATE, TIME, VISIBLE_SHARE, GraphSpec
 from marl_sched.simulation import TurnSimulator
 
 
-class HetGATPolicy(ObservationScheduler):
-    """Decides by a copy of a HetGAT network.
+class NetworkPolicy(ObservationScheduler):
+    """Decides by a copy of a network, whatever its architecture.
 
     At batch size 1 a choice is a function of the observation's bits, the padding included; in a larger batch
     logits agree within 1e-5, as the network then sees it in blocks without what nobody sees
@@ -37,7 +37,7 @@ class HetGATPolicy(ObservationScheduler):
     """
 
     def __init__(
-        self, network: PolicyNetwork, *, name: str = "hetgat", mode: Mode = "greedy", card: PolicyCard | None = None
+        self, network: PolicyNetwork, *, name: str = "unsaved", mode: Mode = "greedy", card: PolicyCard | None = None
     ) -> None:
         if mode not in get_args(Mode):
             raise InvalidOptionError(
@@ -55,7 +55,7 @@ class HetGATPolicy(ObservationScheduler):
         self._checked: GraphSpec | None = None
 
     @classmethod
-    def load(cls, path: str | Path, *, mode: Mode | None = None, graph: GraphSpec | None = None) -> HetGATPolicy:
+    def load(cls, path: str | Path, *, mode: Mode | None = None, graph: GraphSpec | None = None) -> NetworkPolicy:
         """A policy from its files (marl_sched.agents.learned.checkpoint); its name is the file's.
 
         `mode` None is its card's. Raises InvalidFileError for damaged files, or if the policy was trained on
