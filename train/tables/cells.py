@@ -32,13 +32,17 @@ DECIMALS = 6
 
 
 class Play(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind", tag="play"):
-    """Inputs of a cell that is played: whose scores, on what, how often; `view` as JSON with all its options."""
+    """Inputs of a cell that is played: whose scores, on what, how often.
+
+    `view` is as JSON, with all its options. `mode` is a policy's, by its card; a rule has none, and no weights.
+    """
 
     env: str
     scale: str
     objective: str
     scheduler: str
     weights_sha256: str | None
+    mode: str | None
     view: dict[str, Any]
     options: dict[str, Any]
     instances: int
@@ -190,7 +194,11 @@ def _play(inputs: Play, weights: Path | None) -> Cell:
         scale=inputs.scale,
         options=inputs.options,
     )
-    scheduler = create_scheduler(inputs.scheduler if weights is None else weights, domain)
+    scheduler = (
+        create_scheduler(inputs.scheduler, domain)
+        if weights is None
+        else create_scheduler(weights, domain, mode=inputs.mode)
+    )
     problems = domain.instances(inputs.scale, inputs.instances, inputs.seed)
     scores = evaluate_scheduler(domain, scheduler, problems, settings)
     m1 = scores.measures[inputs.objective]

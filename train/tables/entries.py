@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from marl_sched.agents.cards import read_card
 from marl_sched.agents.registry import SHIPPED
 from marl_sched.train.evaluate import view_as_json
 from marl_sched.train.tables.cells import Bound, Job, Play, digest, weights_sha256
@@ -113,6 +114,7 @@ class Entries:
             objective=objective,
             scheduler=name,
             weights_sha256=None if weights is None else self._hash(weights),
+            mode=None if weights is None else read_card(weights.with_suffix(".json")).mode,
             view=view_as_json(self.plan.domain.make_view(dict(view))),
             options=dict(options),
             instances=self.size.instances,

@@ -163,9 +163,10 @@ def _learned(results: Mapping[str, Any]) -> Iterator[str]:
         entries += [(line["label"], point) for line in found["lines"] for point in line["points"].values()]
     for label, entry in entries:
         if (training := entry.get("training")) is not None:
+            mode = {"greedy": "greedily", "sample": "by sampling"}[entry["mode"]]
             knowledge = f" Training used {training['knowledge']}." if training["knowledge"] else ""
-            told = f"`{training['command']}`, seed {training['seed']}, view {_view(training['view'])}.{knowledge}"
-            cards.setdefault(entry["scheduler"], f"- `{entry['scheduler']}` ({label}): {told}")
+            told = f"seed {training['seed']}, view {_view(training['view'])}, plays {mode}.{knowledge}"
+            cards.setdefault(entry["scheduler"], f"- `{entry['scheduler']}` ({label}): `{training['command']}`, {told}")
     if cards:
         yield "## How the learned schedulers were trained"
         yield "\n".join(cards.values())

@@ -133,6 +133,7 @@ class Results:
         bound, base = against["bound"]["M1"]["mean"], float(reference.mean())
         return {
             "scheduler": getattr(cell.inputs, "scheduler", ""),
+            "mode": getattr(cell.inputs, "mode", None),
             "M1": self._summary(cell),
             "M2": {"mean": float(gain.mean()), "std": float(gain.std())},
             "difference": paired_difference(scores, against["best"]).as_json(),

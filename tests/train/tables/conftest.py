@@ -4,6 +4,8 @@ from copy import deepcopy
 
 import pytest
 
+from marl_sched.agents.cards import write_card
+from marl_sched.agents.registry import shipped_policies
 from marl_sched.train.tables.cells import Bound, Cell, Cells, Training
 from marl_sched.train.tables.entries import Entries
 from marl_sched.train.tables.plan import as_plan
@@ -77,10 +79,11 @@ def cells(tmp_path):
 
 @pytest.fixture
 def trained(tmp_path):
-    """The weights of the profit policy are there; they are none that could be loaded."""
+    """The weights of the profit policy are there, with a card; they are none that could be loaded."""
     path = tmp_path / "policies" / "net-profit.safetensors"
     path.parent.mkdir()
     path.write_bytes(b"weights")
+    write_card(path.with_suffix(".json"), shipped_policies()["airme-local-profit"])
     return path
 
 

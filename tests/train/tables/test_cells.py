@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from marl_sched.agents.airme_rules import RULES
+from marl_sched.agents.cards import read_card, write_card
 from marl_sched.domain import get_domain
 from marl_sched.envs.airme.views import LocalView
 from marl_sched.errors import InvalidFileError
@@ -24,6 +25,7 @@ PLAY = Play(
     objective="profit",
     scheduler="condition",
     weights_sha256=None,
+    mode=None,
     view={"kind": "local", "reach": 1, "comm": 1, "staleness": 2},
     options={},
     instances=2,
@@ -40,6 +42,7 @@ OTHERWISE = {
     "objective": "revenue",
     "scheduler": "random",
     "weights_sha256": "00",
+    "mode": "sample",
     "view": {"kind": "local", "reach": 1, "comm": 1, "staleness": 3},
     "options": {"scheme": "skip"},
     "instances": 3,
@@ -130,6 +133,13 @@ def test_weights_that_change_make_another_cell(entries, plan, trained, tmp_path)
     assert digest(before.inputs) != digest(after.inputs)
     with pytest.raises(InvalidFileError, match="the weights that were there when the cells were listed"):
         make(before)
+
+
+def test_another_mode_on_the_card_makes_another_cell(entries, plan, trained, tmp_path):
+    row, card = plan.rows[-1], trained.with_suffix(".json")
+    before = entries.row(row, "profit", "small")
+    write_card(card, msgspec.structs.replace(read_card(card), mode="sample"))
+    assert digest(Entries(plan, plan.full, tmp_path).row(row, "profit", "small").inputs) != digest(before.inputs)
 
 
 def test_a_rule_under_the_same_view_is_played_once(entries, trained):

@@ -87,7 +87,9 @@ def test_the_page_shows_published_values_what_is_known_and_what_is_missing(resul
     net = [line for line in lines if line.startswith("| net<br>(scheme skip)")]
     assert "local (1, 1, 0): 40 %" in net[1]
     assert "not trained yet" in net[2]  # the table of revenue
-    assert "`marl-sched train view=local`, seed 3, view local (1, 1, 0). Training used a teacher." in text
+    assert (
+        "`marl-sched train view=local`, seed 3, view local (1, 1, 0), plays greedily. Training used a teacher." in text
+    )
     assert (
         "- `policies/net-revenue.safetensors` (net): `marl-sched train env.objective=revenue`"
         in text.split("## Not")[1]
