@@ -55,10 +55,11 @@ def tables(
     if not render:
         chosen = [job for job in jobs if job.weights is None] if without_policies else jobs
         _fill(missing(chosen, cells), cells, workers)
-    if not without_policies:
-        command = f"marl-sched tables --env {env}" + (" --quick" if quick else "")
-        for path in write_pages(entries, cells, command, out):
-            typer.echo(path)
+    if without_policies:
+        return
+    command = f"marl-sched tables --env {env}" + (" --quick" if quick else "")
+    for path in write_pages(entries, cells, command, out):
+        typer.echo(path)
     _tell(untrained)
 
 

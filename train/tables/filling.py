@@ -8,11 +8,12 @@ from __future__ import annotations
 import multiprocessing
 import signal
 from collections.abc import Iterable, Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from importlib.util import find_spec
 
-from marl_sched.train.tables.cells import Cell, Cells, Job, make
+from marl_sched.errors import MarlSchedError
+from marl_sched.train.tables.cells import Cell, Cells, Job, describe, make
 
 
 def missing(jobs: Iterable[Job], cells: Cells) -> list[Job]:
@@ -21,12 +22,26 @@ def missing(jobs: Iterable[Job], cells: Cells) -> list[Job]:
 
 
 def fill(jobs: Iterable[Job], cells: Cells, pool: Executor) -> Iterator[tuple[Job, Cell]]:
-    """Make each job's cell and keep it; yields them as they are finished."""
-    futures = {pool.submit(make, job): job for job in jobs}
+    """Make each job's cell and keep it; yields them as they are finished.
+
+    Raises MarlSchedError, with the job's name, for a job that cannot be done or whose process was killed.
+    """
+    futures = {pool.submit(_attempt, job): job for job in jobs}
     for future in as_completed(futures):
-        cell = future.result()
+        try:
+            cell = future.result()
+        except BrokenExecutor as error:
+            job = futures[future]
+            raise MarlSchedError(f"{describe(job.inputs)}: a process was killed before it was done") from error
         cells.write(cell)
         yield futures[future], cell
+
+
+def _attempt(job: Job) -> Cell:
+    try:
+        return make(job)
+    except MarlSchedError as error:  # errors with arguments of their own do not survive the way between processes
+        raise MarlSchedError(f"{describe(job.inputs)}: {error}") from None
 
 
 @contextmanager

@@ -47,7 +47,8 @@ def _head(results: Mapping[str, Any]) -> Iterator[str]:
         f"in percent over {results['reference']} on the same instance; ± is the standard deviation over instances of "
         "their means. *In italics*, below: what the dissertation published (tables 6.2 to 6.4), on other instances of "
         "the same distribution. **Difference** is paired, to the best rule on that scale that does not know the "
-        "failure model, with Student's 95 percent interval over instances. **Way** is how much of the distance from "
+        "failure model, with Student's 95 percent interval over instances; **IQM** is the interquartile mean of the "
+        "instances with its bootstrap interval. **Way** is how much of the distance from "
         f"{results['reference']} to the upper bound a scheduler goes. The bound is proved for every instance by "
         f"`marl-sched bound` ({bound['price_vectors']} price vectors, {bound['evaluations']} evaluations): no "
         "scheduler expects more, even if it knows the failure model and the clock; a mean over few episodes can pass "
@@ -88,7 +89,7 @@ def _against_limits(table: Mapping[str, Any]) -> str:
     """What every row knows, and what it reaches of what can be reached."""
     scales = list(table["scales"])
     heads = ["scheduler", "sees", "knows besides"]
-    heads += [f"{scale}: difference to {table['scales'][scale]['best_rule']}" for scale in scales]
+    heads += [f"{scale}: IQM, difference to {table['scales'][scale]['best_rule']}" for scale in scales]
     heads += [f"way % {'/'.join(scales)}"]
     rows = []
     for row in table["rows"]:
@@ -101,11 +102,19 @@ def _against_limits(table: Mapping[str, Any]) -> str:
                 _name(row),
                 _sees(row, played),
                 played[0]["needs"] or "nothing",
-                *(_difference(entry.get("difference"), 4) for entry in entries),
+                *(_against(entry) for entry in entries),
                 " / ".join(f"{entry['way']:.1f}" if "way" in entry else _NONE for entry in entries),
             ]
         )
     return _markdown(heads, rows)
+
+
+def _against(entry: Mapping[str, Any]) -> str:
+    """Interquartile mean and paired difference, each with its interval."""
+    if "M1" not in entry:
+        return _NONE
+    low, high = entry["M1"]["ci95"]
+    return f"{entry['M1']['iqm']:.4f} [{low:.4f}, {high:.4f}]<br>{_difference(entry['difference'])}"
 
 
 def _sees(row: Mapping[str, Any], played: Sequence[Mapping[str, Any]]) -> str:
@@ -151,7 +160,7 @@ def _point(line: Mapping[str, Any], view: str) -> str:
         return "not trained yet" if view in line["untrained"] else _NONE
     score = f"{point['M1']['mean']:.4f} ± {point['M1']['std']:.3f}"
     cost = point.get("cost")
-    return score if cost is None or cost["mean"] == 0.0 else f"{score}<br>{_difference(cost, 4)}"
+    return score if cost is None or cost["mean"] == 0.0 else f"{score}<br>{_difference(cost)}"
 
 
 def _learned(results: Mapping[str, Any]) -> Iterator[str]:
@@ -202,14 +211,12 @@ def _spread(measure: str, mean: float, std: float) -> str:
     return " ± ".join(f"{x:.{3 if measure == 'M1' else 1 if abs(x) >= 10 else 2}f}" for x in (mean, std))
 
 
-def _difference(difference: Mapping[str, Any] | None, decimals: int) -> str:
-    if difference is None:
-        return _NONE
-    told = f"{difference['mean']:+.{decimals}f}"
+def _difference(difference: Mapping[str, Any]) -> str:
+    told = f"{difference['mean']:+.4f}"
     if difference["ci95"] is None:
         return told
     low, high = difference["ci95"]
-    return f"{told}<br>[{low:+.{decimals}f}, {high:+.{decimals}f}]"
+    return f"{told} [{low:+.4f}, {high:+.4f}]"
 
 
 def _markdown(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

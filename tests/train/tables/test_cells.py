@@ -1,6 +1,7 @@
 """Cells: named by all that decides their scores, made once, kept whole."""
 
 import json
+import multiprocessing
 from concurrent.futures import ThreadPoolExecutor
 
 import msgspec
@@ -11,12 +12,12 @@ from marl_sched.agents.airme_rules import RULES
 from marl_sched.agents.cards import read_card, write_card
 from marl_sched.domain import get_domain
 from marl_sched.envs.airme.views import LocalView
-from marl_sched.errors import InvalidFileError
+from marl_sched.errors import InvalidFileError, MarlSchedError
 from marl_sched.train.evaluate import Settings, evaluate_scheduler
 from marl_sched.train.tables import filling
 from marl_sched.train.tables.cells import Bound, Cell, Job, Play, digest, make
 from marl_sched.train.tables.entries import Entries
-from marl_sched.train.tables.filling import fill, missing
+from marl_sched.train.tables.filling import fill, missing, worker_processes
 
 AIRME = get_domain("airme")
 PLAY = Play(
@@ -192,11 +193,17 @@ def test_a_run_that_was_stopped_goes_on_where_it_was(entries, cells, monkeypatch
 
 
 @pytest.mark.slow
+def test_what_cannot_be_made_is_told_by_the_workers_in_full(entries, cells, plan, trained):
+    job = entries.row(plan.rows[-1], "profit", "small")
+    trained.write_bytes(b"other weights")
+    told = r"net-profit.*, small, .*: .*net-profit\.safetensors: expected the weights that were there"
+    with worker_processes(1) as pool, pytest.raises(MarlSchedError, match=told):
+        list(fill([job], cells, pool))
+    assert not cells.folder.exists()
+
+
+@pytest.mark.slow
 def test_workers_are_gone_after_an_error():
-    import multiprocessing
-
-    from marl_sched.train.tables.filling import worker_processes
-
     before = set(multiprocessing.active_children())
 
     def stopped_at_work():
