@@ -1,4 +1,4 @@
-"""How good choices were: two estimators to choose from, both along the team's sequence of turns.
+"""How good choices were: estimators to choose from, along the team's sequence of turns or along an agent's own.
 
 Time passes only when all agents that are free have acted, so discounting is semi-Markov: a turn that lets
 e units of simulated time pass discounts what follows by gamma ** e, and by 1 within a moment.
@@ -50,6 +50,62 @@ def generalised_advantages(
         terminated=~alive[1:],
     )
     return torch.where(taken, advantages, 0.0), torch.where(taken, targets, 0.0)
+
+
+def own_turn_advantages(
+    rewards: Tensor,
+    elapsed: Tensor,
+    values: Tensor,
+    agents: Tensor,
+    valid: Tensor,
+    alive: Tensor,
+    *,
+    discount: float,
+    trace: float,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Generalised advantage estimates along each agent's own turns, as independent learners have them (IPPO).
+
+    To an agent a turn lasts until its next own one. It earns all that the team does in between, discounted to the
+    turn's moment, and what follows is discounted by gamma to the power of the time between.
+
+    At a cut and at the segment's end only one agent is about to act; the value of the others' future is not known.
+    An agent's last turn before it therefore is not learned from, it only serves the turn before as its future; where
+    an episode truly ends nothing is lost. A turn after which an agent is busy for long is lost more often, so a
+    segment should be many jobs long.
+
+    `agents` int64 (T + 1, B) says who was to act, -1 where nobody was; the other arguments are as for
+    `generalised_advantages`. Returns advantages and value targets, float64 (T, B), and bool
+    (T, B), which turns are to be learned from.
+    """
+    turns, batch = rewards.shape
+    rows, owner = torch.arange(batch), agents.clamp(min=0)
+    values = torch.where(alive, values.double(), 0.0)
+    advantages, targets = torch.zeros(2, turns, batch, dtype=torch.float64)
+    counted = torch.zeros(turns, batch, dtype=torch.bool)
+    # of each agent, (B, A): its next own turn's value and advantage, what is earned and how long it takes until then
+    following, credit, earned, passed = torch.zeros(4, batch, int(owner.max()) + 1, dtype=torch.float64)
+    known = torch.zeros_like(following, dtype=torch.bool)  # that value is known; an end's is 0
+    for t in reversed(range(turns + 1)):
+        taken = valid[t] if t < turns else torch.zeros_like(valid[t])
+        for books in (following, credit, earned, passed):
+            books[~taken] = 0.0
+        known[~taken] = ~alive[t, ~taken, None]
+        who = owner[t]
+        if t < turns:
+            span = torch.where(taken, elapsed[t].double(), 0.0)[:, None]
+            earned = torch.where(taken, rewards[t].double(), 0.0)[:, None] + discount**span * earned
+            passed = passed + span
+            counted[t] = taken & known[rows, who]
+            discounted = discount ** passed[rows, who]
+            target = earned[rows, who] + discounted * following[rows, who]
+            target = target + discounted * trace ** passed[rows, who] * credit[rows, who]
+            advantages[t] = torch.where(counted[t], target - values[t], 0.0)
+            targets[t] = torch.where(counted[t], target, 0.0)
+            credit[rows, who] = advantages[t]
+        following[rows, who] = values[t]
+        known[rows, who] |= taken | alive[t]
+        earned[rows, who] = passed[rows, who] = 0.0
+    return advantages, targets, counted
 
 
 def returns_by_time(

@@ -43,6 +43,7 @@ class Rollout:
         log_probs: float32 (T, B), of the targets under the policy that chose them.
         rewards, elapsed: float64 and int64 (T, B).
         times: int64 (T + 1, B), simulated time at each turn.
+        agents: int64 (T + 1, B), whose turn it is, -1 where nobody's.
         valid: bool (T + 1, B), a turn that was taken and counts; what the others hold is meaningless.
         alive: bool (T + 1, B), the state has a future; true at a cut, where no turn is valid.
         length: episode length in simulated time.
@@ -55,6 +56,7 @@ class Rollout:
     rewards: Tensor
     elapsed: Tensor
     times: Tensor
+    agents: Tensor
     valid: Tensor
     alive: Tensor
     length: int
@@ -124,7 +126,7 @@ class _Recorder:
         if self._central:
             self._views[1].append({name: torch.from_numpy(a) for name, a in simulator.observe_all().items()})
         self._keep(valid=torch.from_numpy(valid), alive=torch.from_numpy(alive))
-        self._keep(times=torch.from_numpy(simulator.time.copy()))
+        self._keep(times=torch.from_numpy(simulator.time.copy()), agents=torch.from_numpy(simulator.acting.copy()))
 
     def step(self, state: TensorDictBase, act: Act) -> tuple[TensorDictBase, Tensor]:
         """Take a turn; the next state and the targets chosen."""

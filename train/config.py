@@ -89,8 +89,8 @@ class PpoConfig(_Config, frozen=True, kw_only=True):
     keep_least: Annotated[float, Meta(gt=0, le=1)]
 
 
-class GaeConfig(_Config, frozen=True, kw_only=True, tag_field="name", tag="gae"):
-    """Advantages from a critic on the full graph; rows play on from update to update, `turns` turns each."""
+class _CriticConfig(_Config, frozen=True, kw_only=True):
+    """Generalised advantages from a critic; rows play on from update to update, `turns` turns each."""
 
     instances: Count
     turns: Count
@@ -99,6 +99,14 @@ class GaeConfig(_Config, frozen=True, kw_only=True, tag_field="name", tag="gae")
     centred: bool
     critic: HetGATConfig
     ppo: PpoConfig
+
+
+class GaeConfig(_CriticConfig, frozen=True, kw_only=True, tag_field="name", tag="gae"):
+    """Along the team's turns, with a critic on the full graph."""
+
+
+class IppoConfig(_CriticConfig, frozen=True, kw_only=True, tag_field="name", tag="ippo"):
+    """Along each agent's own turns, with a critic on what the agent sees."""
 
 
 class StepBaselineConfig(_Config, frozen=True, kw_only=True, tag_field="name", tag="step_baseline"):
@@ -158,7 +166,7 @@ class TrainConfig(_Config, frozen=True, kw_only=True):
     env: EnvConfig
     view: dict[str, Any]
     policy: PolicyConfig
-    algorithm: GaeConfig | StepBaselineConfig | ImitationConfig
+    algorithm: GaeConfig | IppoConfig | StepBaselineConfig | ImitationConfig
     curriculum: CurriculumConfig
     validation: ValidationConfig
     start_from: str | None = None

@@ -8,7 +8,7 @@ from typing import Protocol
 import torch
 from torch import Tensor, nn
 
-from marl_sched.train.advantages import generalised_advantages, step_baseline_advantages
+from marl_sched.train.advantages import generalised_advantages, own_turn_advantages, step_baseline_advantages
 from marl_sched.train.collect import Rollout
 
 _RATE_STEP = 0.2  # of the exponential average of the reward rate
@@ -16,18 +16,26 @@ _RATE_STEP = 0.2  # of the exponential average of the reward rate
 
 @dataclass(frozen=True)
 class Estimate:
-    """Advantages (T, B), value targets (T, B) or None, and how much of the targets' variance the critic explains."""
+    """What a rollout's turns were worth.
+
+    Attributes:
+        advantages: float64 (T, B).
+        value_targets: float64 (T, B), None without a critic.
+        explained_variance: how much of the targets' variance the critic explains.
+        counted: bool (T, B), turns to learn from, all of them valid.
+    """
 
     advantages: Tensor
     value_targets: Tensor | None
     explained_variance: float
+    counted: Tensor
 
 
 class Estimator(Protocol):
     """What the training loop asks for."""
 
     def estimate(self, rollout: Rollout) -> Estimate:
-        """Advantages of a rollout's turns, zero where a turn is not valid."""
+        """Advantages of a rollout's turns, zero where a turn is not to be learned from."""
 
     def state(self) -> dict[str, float | None]:
         """What a resumed run needs, as JSON."""
@@ -56,8 +64,13 @@ class CriticEstimator:
             rate = seen if self._rate is None else self._rate + _RATE_STEP * (seen - self._rate)
             self._rate = rate
         values = self._values(rollout)
+        advantages, targets, counted = self._credit(rollout, rollout.rewards - rate * rollout.elapsed, values)
+        return Estimate(advantages, targets, explained_variance(targets, values[:-1], counted), counted)
+
+    def _credit(self, rollout: Rollout, rewards: Tensor, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Advantages, value targets and the turns to learn from, (T, B) each."""
         advantages, targets = generalised_advantages(
-            rollout.rewards - rate * rollout.elapsed,
+            rewards,
             rollout.elapsed,
             values,
             rollout.valid,
@@ -65,10 +78,7 @@ class CriticEstimator:
             discount=self._discount,
             trace=self._trace,
         )
-        valid = rollout.valid[:-1]
-        residual = (targets - values[:-1])[valid].var(correction=0)
-        variance = targets[valid].var(correction=0)
-        return Estimate(advantages, targets, float(1 - residual / variance.clamp(min=1e-12)))
+        return advantages, targets, rollout.valid[:-1]
 
     @torch.inference_mode()
     def _values(self, rollout: Rollout) -> Tensor:
@@ -89,6 +99,25 @@ class CriticEstimator:
         self._rate = state["reward_rate"]
 
 
+class OwnTurns(CriticEstimator):
+    """Independent learners (IPPO): generalised advantages along each agent's own turns (`own_turn_advantages`).
+
+    For rollouts without a central graph, in which the critic sees what the acting agent does.
+    """
+
+    def _credit(self, rollout: Rollout, rewards: Tensor, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        return own_turn_advantages(
+            rewards,
+            rollout.elapsed,
+            values,
+            rollout.agents,
+            rollout.valid,
+            rollout.alive,
+            discount=self._discount,
+            trace=self._trace,
+        )
+
+
 class StepBaseline:
     """The dissertation's baseline: the mean return of all episodes of the instance, its own too, at the same time."""
 
@@ -106,7 +135,7 @@ class StepBaseline:
             length=rollout.length,
             episodes=self._episodes,
         )
-        return Estimate(advantages, None, 0.0)
+        return Estimate(advantages, None, 0.0, rollout.valid[:-1])
 
     def state(self) -> dict[str, float | None]:
         """Nothing."""
@@ -114,3 +143,9 @@ class StepBaseline:
 
     def restore(self, state: dict[str, float | None]) -> None:
         """Nothing."""
+
+
+def explained_variance(targets: Tensor, values: Tensor, counted: Tensor) -> float:
+    """Share of the variance of value targets that values explain, over the `counted` turns; all (T, B)."""
+    residual = (targets - values)[counted].var(correction=0)
+    return float(1 - residual / targets[counted].var(correction=0).clamp(min=1e-12))

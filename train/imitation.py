@@ -55,7 +55,7 @@ class Imitation:
         return dict(zip(names, np.mean(reports, axis=0).tolist(), strict=True))
 
     def _samples(self, rollout: Rollout, rng: np.random.Generator) -> TensorDict:
-        samples, names, rows = thinned(self.policy, rollout, self._config.keep_least, rng)
+        samples, names, rows = thinned(self.policy, rollout, rollout.valid[:-1], self._config.keep_least, rng)
         turns = rollout.targets.shape[0]
         truth = {name: v[:turns].flatten(0, 1)[rows].numpy() for name, v in rollout.central.items()}
         advantages = self._teacher.advantages(truth)

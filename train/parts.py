@@ -27,13 +27,14 @@ from marl_sched.train.config import (
     GaeConfig,
     HetGATConfig,
     ImitationConfig,
+    IppoConfig,
     PolicyConfig,
     RunRecord,
     StepBaselineConfig,
     TrainConfig,
 )
 from marl_sched.train.curriculum import EpisodeLength
-from marl_sched.train.estimators import CriticEstimator, StepBaseline
+from marl_sched.train.estimators import CriticEstimator, OwnTurns, StepBaseline
 from marl_sched.train.export import save_best
 from marl_sched.train.imitation import Imitation
 from marl_sched.train.learner import Learner, PolicyGradient
@@ -90,6 +91,8 @@ def _with_algorithm(config: TrainConfig, length: EpisodeLength) -> tuple[Collect
     match config.algorithm:
         case GaeConfig() as algorithm:
             return _with_critic(config, algorithm, length)
+        case IppoConfig() as algorithm:
+            return _with_own_critic(config, algorithm, length)
         case StepBaselineConfig() as algorithm:
             return _with_step_baseline(config, algorithm, length)
         case ImitationConfig() as algorithm:
@@ -102,6 +105,14 @@ def _with_critic(config: TrainConfig, algorithm: GaeConfig, length: EpisodeLengt
     estimator = CriticEstimator(critic, discount=algorithm.discount, trace=algorithm.trace, centred=algorithm.centred)
     learner = PolicyGradient(Ppo(_policy(config, env), critic, algorithm.ppo), estimator)
     return _segments(config, env, algorithm.turns, length), learner
+
+
+def _with_own_critic(config: TrainConfig, algorithm: IppoConfig, length: EpisodeLength) -> tuple[Collector, Learner]:
+    env = _environment(config, length, rows=algorithm.instances, episodes=1)
+    critic = HetGATCritic(env.simulator.graph, **msgspec.structs.asdict(algorithm.critic))
+    estimator = OwnTurns(critic, discount=algorithm.discount, trace=algorithm.trace, centred=algorithm.centred)
+    learner = PolicyGradient(Ppo(_policy(config, env), critic, algorithm.ppo), estimator)
+    return SegmentCollector(env, turns=algorithm.turns, length=length(0), central=False), learner
 
 
 def _with_step_baseline(

@@ -53,22 +53,21 @@ class Sampler:
 
 
 def thinned(
-    policy: PolicyNetwork, rollout: Rollout, keep_least: float, rng: np.random.Generator
+    policy: PolicyNetwork, rollout: Rollout, counted: Tensor, keep_least: float, rng: np.random.Generator
 ) -> tuple[TensorDict, Tensor, Tensor]:
-    """Valid turns of a rollout as a flat TensorDict of compacted graphs, with weights.
+    """Turns of a rollout as a flat TensorDict of compacted graphs, with weights.
 
-    Turns that are not valid are left behind here, whatever they hold. Of the others a turn is kept with
-    probability q = max(1 - p, keep_least), p being the probability of what was chosen, and weighs 1 / q:
+    Turns that are not `counted`, bool (T, B), are left behind here, whatever they hold. Of the others a turn is
+    kept with probability q = max(1 - p, keep_least), p being the probability of what was chosen, and weighs 1 / q:
     where a policy is nearly certain (a crew that waits, hour after hour) there is little to learn, and
     the weights keep every sum's expectation. `keep_least` 1 keeps all.
 
     Returns the samples, the target that each decision node of theirs stands for, int64 (N, n_kept), and
     the row of the flattened rollout (T B) that each comes from, int64 (N,).
     """
-    valid = rollout.valid[:-1]
-    certainty = torch.where(valid, rollout.log_probs, 0.0).exp()
+    certainty = torch.where(counted, rollout.log_probs, 0.0).exp()
     keep = (1 - certainty).clamp(keep_least, 1.0)
-    rows = (valid & (torch.from_numpy(rng.random(valid.shape)) < keep)).flatten().nonzero().squeeze(1)
+    rows = (counted & (torch.from_numpy(rng.random(counted.shape)) < keep)).flatten().nonzero().squeeze(1)
     observation, names = _as_read(policy, _picked(rollout.observation, rows))
     data = {"observation": observation, "weight": (1 / keep).flatten()[rows]}
     return TensorDict(data, batch_size=[len(rows)]), names, rows
@@ -78,14 +77,14 @@ def samples_of(
     policy: PolicyNetwork, rollout: Rollout, estimate: Estimate, keep_least: float, rng: np.random.Generator
 ) -> TensorDict:
     """Turns to learn from (`thinned`), with what was chosen, normalised advantages and value targets."""
-    samples, names, rows = thinned(policy, rollout, keep_least, rng)
+    samples, names, rows = thinned(policy, rollout, estimate.counted, keep_least, rng)
 
     def pick(values: Tensor) -> Tensor:
         return values.flatten(0, 1)[rows]
 
     samples["target"] = (names == pick(rollout.targets)[:, None]).int().argmax(1)
     samples["log_prob"] = pick(rollout.log_probs)
-    samples["advantage"] = pick(normalised(estimate.advantages, rollout.valid[:-1])).float()
+    samples["advantage"] = pick(normalised(estimate.advantages, estimate.counted)).float()
     if estimate.value_targets is not None:
         samples["value_target"] = pick(estimate.value_targets).float()
         if rollout.central is not rollout.observation:

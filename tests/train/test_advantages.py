@@ -9,6 +9,7 @@ import torch
 from marl_sched.train.advantages import (
     generalised_advantages,
     normalised,
+    own_turn_advantages,
     returns_by_time,
     step_baseline_advantages,
 )
@@ -49,6 +50,54 @@ def test_an_end_is_worth_nothing_and_a_cut_is_worth_its_value():
     cut, _ = generalised_advantages(rewards, elapsed, values, valid, flags(1, 1, 1), discount=0.5, trace=0.0)
     assert ended[:, 0].tolist() == [1.0, 1.0]
     assert cut[:, 0].tolist() == [1.0, 51.0]
+
+
+def test_an_own_turn_lasts_until_the_agents_next_one_and_earns_what_the_team_does():
+    # gamma = lambda = 1/2. Agents 0 and 1 act in hour 0, 0 again in hour 1, 1 in hour 3, 0 in hour 4, where the
+    # segment ends.   turn:    0      1      2      3     (4)
+    #                 agent    0      1      0      1      0
+    #                 hours    0      1      2      1
+    #                 reward   0      2      4      8
+    # Agent 0, turn 2: earns 4 + 8/4 = 6 in 3 hours, target 6 + 40/8 = 11, advantage 11 - 3 = 8.
+    #          turn 0: earns 0 + 2 = 2 in 1 hour, target 2 + 3/2 + (1/2)(1/2) 8 = 5.5, advantage 5.5 - 1 = 4.5.
+    # Agent 1, turn 3 is its last: not learned from. Turn 1: earns 2 + 4/2 = 4 in 3 hours, target 4 + 16/8 = 6,
+    #          advantage 6 - 5 = 1; nothing flows back from turn 3 but its value.
+    advantages, targets, counted = own_turn_advantages(
+        column(0, 2, 4, 8), column(0, 1, 2, 1), column(1, 5, 3, 16, 40),
+        torch.tensor([[0], [1], [0], [1], [0]]), flags(1, 1, 1, 1, 1), flags(1, 1, 1, 1, 1), discount=0.5, trace=0.5,
+    )  # fmt: skip
+    assert counted[:, 0].tolist() == [True, True, True, False]
+    assert advantages[:, 0].tolist() == [4.5, 1.0, 8.0, 0.0]
+    assert targets[:, 0].tolist() == [5.5, 6.0, 11.0, 0.0]
+
+
+def test_no_own_turn_is_lost_where_an_episode_ends_and_none_reaches_over_its_cut():
+    # Turn 2 of row 0 is an end, of row 1 a cut at which agent 1 was to act. After it another episode begins. gamma 1.
+    # Row 0: both turns run to the end. Agent 0 earns 1 + 2, agent 1 earns 2.
+    # Row 1: agent 1 has the value of the cut, 2 + 7; agent 0 has no future that is known.
+    agents = torch.tensor([[0, 0], [1, 1], [-1, 1], [0, 1], [0, 0]])
+    valid = torch.tensor([[1, 1], [1, 1], [0, 0], [1, 1], [1, 1]]).bool()
+    alive = torch.tensor([[1, 1], [1, 1], [0, 1], [1, 1], [1, 1]]).bool()
+    rewards = torch.tensor([[1.0, 1.0], [2.0, 2.0], [NAN, NAN], [100.0, 100.0]])
+    values = torch.tensor([[0.0, 0.0], [0.0, 0.0], [NAN, 7.0], [0.0, 0.0], [1000.0, 1000.0]])
+    advantages, _, counted = own_turn_advantages(
+        rewards, torch.ones(4, 2, dtype=torch.int64), values, agents, valid, alive, discount=1.0, trace=1.0
+    )
+    assert counted.T.tolist() == [[True, True, False, True], [False, True, False, False]]
+    assert advantages.T.tolist() == [[3.0, 2.0, 0.0, 1100.0], [0.0, 9.0, 0.0, 0.0]]
+
+
+def test_one_agents_own_turns_are_the_teams():
+    rng = np.random.default_rng(4)
+    rewards, values = torch.from_numpy(rng.normal(size=(20, 6))), torch.from_numpy(rng.normal(size=(21, 6)))
+    elapsed = torch.from_numpy(rng.integers(0, 4, (20, 6)))
+    alive = torch.from_numpy(rng.random((21, 6)) < 0.9)
+    valid = alive & torch.from_numpy(rng.random((21, 6)) < 0.8)
+    factors = {"discount": 0.9, "trace": 0.7}
+    team = generalised_advantages(rewards, elapsed, values, valid, alive, **factors)
+    own = own_turn_advantages(rewards, elapsed, values, torch.zeros_like(valid).long(), valid, alive, **factors)
+    assert own[2].equal(valid[:-1])
+    torch.testing.assert_close(own[:2], team)
 
 
 def test_nothing_reaches_over_a_cut_into_the_next_episode():

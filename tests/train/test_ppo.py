@@ -121,7 +121,7 @@ def test_kept_turns_weigh_as_much_as_all_turns_in_expectation():
     policy, _ = networks()
     torch.nn.init.normal_(policy.readout.weight, std=20.0)  # choices that are nearly certain
     rollout = segment(policy)
-    everything = Estimate(torch.randn(rollout.rewards.shape, dtype=torch.float64), None, 0.0)
+    everything = Estimate(torch.randn(rollout.rewards.shape, dtype=torch.float64), None, 0.0, rollout.valid[:-1])
     rng = np.random.default_rng(0)
     all_turns = samples_of(policy, rollout, everything, 1.0, rng)
     drawn = [samples_of(policy, rollout, everything, 0.2, rng) for _ in range(300)]
@@ -135,7 +135,7 @@ def test_a_better_choice_becomes_more_probable():
     policy, _ = networks()
     rollout = EpisodeCollector(environment(rows=4, episodes=2), central=False).collect(Sampler(policy), 10)
     good = rollout.targets == 0
-    estimate = Estimate(torch.where(good, 1.0, -1.0).double(), None, 0.0)
+    estimate = Estimate(torch.where(good, 1.0, -1.0).double(), None, 0.0, rollout.valid[:-1])
     samples = samples_of(policy, rollout, estimate, 1.0, np.random.default_rng(0))
     idle = samples["target"] == 0
     assert idle.any()
