@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
 
 from marl_sched.files import replacing
 
@@ -150,11 +151,12 @@ def shares_against_scores(panels: Mapping[str, Mapping[str, Any]], *, measure: s
 
     A panel is `{"bound": float, "central": (label, float), "lines": {label: [(share, score, stale), ...]}}`; points
     of old data (`stale`) are open and stand beside the line. A scheduler has the same colour and shape everywhere;
-    the bound and the score of the best scheduler that sees everything are level lines.
+    the bound and the score of the best scheduler that sees everything are level lines. As most of what matters lies
+    close below the bound, the axis of scores is logarithmic in their distance to a level a little above it.
     """
     labels = list(dict.fromkeys(label for panel in panels.values() for label in panel["lines"]))
     looks = {label: (_LINES[i % len(_LINES)], "osD^vP"[i % 6]) for i, label in enumerate(labels)}
-    figure = Figure(figsize=(1.5 + 4.6 * len(panels), 5.6), layout="constrained")
+    figure = Figure(figsize=(1.5 + 4.6 * len(panels), 6.0), layout="constrained")
     all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
     for axes, (caption, panel) in zip(all_axes, panels.items(), strict=True):
         for label, points in panel["lines"].items():
@@ -171,7 +173,8 @@ def shares_against_scores(panels: Mapping[str, Mapping[str, Any]], *, measure: s
         axes.set_xlim(0, 104)
         _plain(axes)
         axes.grid(color=_FAINT, lw=0.6)
-    all_axes[0].set_ylabel(measure)
+    _stretch_towards(max(panel["bound"] for panel in panels.values()), all_axes)
+    all_axes[0].set_ylabel(f"{measure}, stretched towards the bound")
     handles = [Line2D([], [], color=colour, marker=marker, label=label) for label, (colour, marker) in looks.items()]
     handles += [
         Line2D([], [], color=_INK, marker="o", mfc="white", ls="none", label="open: others' sectors seen late"),
@@ -180,3 +183,18 @@ def shares_against_scores(panels: Mapping[str, Mapping[str, Any]], *, measure: s
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     return figure
+
+
+def _stretch_towards(level: float, all_axes: Sequence[Axes]) -> None:
+    """Make the shared axis of scores logarithmic in their distance to a level a little above the highest line."""
+    low, high = all_axes[0].get_ylim()
+    top = level + 0.15 * (high - low)
+    ticks = [
+        tick for tick in MaxNLocator(nbins=12, steps=[1, 2, 5, 10]).tick_values(low, level) if low <= tick <= level
+    ]
+    for axes in all_axes:
+        axes.set_yscale(
+            "function", functions=(lambda y: -np.log(np.maximum(top - y, 1e-9)), lambda z: top - np.exp(-z))
+        )
+        axes.set_ylim(low, level + 0.015 * (high - low))
+        axes.set_yticks(ticks, [f"{tick:.3f}" for tick in ticks])

@@ -6,7 +6,9 @@ A cell is written when it is finished, so whatever stops the work costs no more 
 from __future__ import annotations
 
 import multiprocessing
+import os
 import signal
+import threading
 from collections.abc import Iterable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
@@ -62,7 +64,16 @@ def worker_processes(workers: int) -> Iterator[Executor]:
 
 def _begin_work() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process; the parent ends the workers
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     if find_spec("torch") is not None:
         import torch
 
         torch.set_num_threads(1)
+
+
+def _end_with_parent() -> None:
+    """End this process when the one that started it is gone, however it went."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)

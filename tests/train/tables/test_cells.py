@@ -2,6 +2,8 @@
 
 import json
 import multiprocessing
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import msgspec
@@ -218,3 +220,25 @@ def test_workers_are_gone_after_an_error():
     for process in left:
         process.join(30)
         assert process.exitcode is not None
+
+
+ORPHANS = """
+import os, sys, time
+from marl_sched.train.tables.filling import worker_processes
+
+if __name__ == "__main__":
+    with worker_processes(1) as pool:
+        print(pool.submit(os.getpid).result(), flush=True)
+        pool.submit(time.sleep, 600)
+        os.kill(os.getpid(), 9)
+"""
+
+
+@pytest.mark.slow
+def test_workers_are_gone_when_their_parent_was_killed(tmp_path):
+    script = tmp_path / "orphans.py"
+    script.write_text(ORPHANS)
+    # the worker, with ten minutes to sleep, holds the other end of this pipe: to read it to its end is to outlive it
+    done = subprocess.run([sys.executable, str(script)], stdout=subprocess.PIPE, text=True, timeout=200, check=False)
+    assert done.returncode == -9
+    assert int(done.stdout) > 0
