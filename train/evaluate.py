@@ -31,7 +31,7 @@ SCHEMA = 1
 EXACT = "exact"  # the scheduler that the others' gap is taken to where it plays
 SHARE_EVERY = 8  # turns between two readings of the visible share
 LOCAL_SHARE = 0.45  # a view that shows more of the graph than this is not called local
-_CHUNK_CELLS = 512 * 41 * 16  # pairs of target and agent in flight: 512 rows of a small AirME fleet
+_CHUNK_CELLS = 2048 * 41 * 16  # pairs of target and agent in flight: 2048 rows of a small AirME fleet, 288 of a large
 
 Progress = Callable[[float], None]
 """Told the share of the work that is done, in [0, 1]."""

@@ -189,11 +189,11 @@ class HetGATLayer(nn.Module):
         out: dict[str, Tensor] = {}
         for name in self.outputs:
             shape = (graph.batch, graph.counts[name], self.out_size)
-            total = sent[name] if name in sent else self.bias[name].expand(shape[0] * shape[1], -1).contiguous()
+            total = sent[name] if name in sent else self.bias[name].repeat(shape[0] * shape[1], 1)
             for relation in self._to_rows[name]:
                 self._add_to_rows(relation, total, step)
             for relation in self._to_grid[name]:
-                total = total.view(shape) + self._messages(relation, step)
+                total = total.view(shape).add_(self._messages(relation, step))
             out[name] = total.relu_().view(shape)
         return out
 

@@ -207,3 +207,12 @@ def test_untrained_networks_explore_all_legal_targets_alike_and_value_everything
     uniform = 1 / legal.sum(-1, keepdim=True)
     assert torch.where(legal, (probabilities - uniform).abs(), 0.0).max() < 0.1 * uniform.min()
     assert (HetGATCritic(graph)(observation) == 0).all()
+
+
+def test_a_forward_pass_on_a_single_node_leaves_the_weights_as_they_are(fleet, observe):
+    network = network_for(fleet)
+    before = {name: tensor.clone() for name, tensor in network.state_dict().items()}
+    with torch.inference_mode():
+        network(observe(fleet, {"plane": 1, "crew": 1}, batch=1))
+    for name, tensor in network.state_dict().items():
+        assert torch.equal(tensor, before[name]), name
