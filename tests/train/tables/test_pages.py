@@ -96,6 +96,14 @@ def test_the_page_shows_published_values_what_is_known_and_what_is_missing(resul
     )
 
 
+def test_a_remark_of_the_list_stands_below_the_tables(tiny, cells, trained, write, tmp_path):
+    tiny["rows"][1]["remark"] = "serves by hours alone"
+    plan = as_plan(tiny, "tiny.yaml")
+    entries = Entries(plan, plan.full, tmp_path)
+    write(entries, cells)
+    assert "## Remarks\n\n- Condition-based: serves by hours alone\n" in page(Results(entries, cells, "").as_json())
+
+
 def test_a_view_that_shows_too_much_is_not_called_local(entries, cells, trained, write, plan):
     import msgspec
 
