@@ -118,6 +118,16 @@ class StepBaselineConfig(_Config, frozen=True, kw_only=True, tag_field="name", t
     ppo: PpoConfig
 
 
+class StateValueConfig(_Config, frozen=True, kw_only=True, tag_field="name", tag="state_value"):
+    """Whole episodes as `step_baseline` plays them, with a critic on the state node as baseline (section 6.5.4)."""
+
+    instances: Count
+    episodes: Count
+    discount: Share
+    critic: HetGATConfig
+    ppo: PpoConfig
+
+
 class ImitationConfig(_Config, frozen=True, kw_only=True, tag_field="name", tag="imitation"):
     """Choices scored by a scheduler that knows more; temperature and learning rate change linearly.
 
@@ -166,7 +176,7 @@ class TrainConfig(_Config, frozen=True, kw_only=True):
     env: EnvConfig
     view: dict[str, Any]
     policy: PolicyConfig
-    algorithm: GaeConfig | IppoConfig | StepBaselineConfig | ImitationConfig
+    algorithm: GaeConfig | IppoConfig | StepBaselineConfig | StateValueConfig | ImitationConfig
     curriculum: CurriculumConfig
     validation: ValidationConfig
     start_from: str | None = None

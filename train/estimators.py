@@ -63,7 +63,7 @@ class CriticEstimator:
             seen = rollout.reward_rate
             rate = seen if self._rate is None else self._rate + _RATE_STEP * (seen - self._rate)
             self._rate = rate
-        values = self._values(rollout)
+        values = values_of(self._critic, rollout)
         advantages, targets, counted = self._credit(rollout, rollout.rewards - rate * rollout.elapsed, values)
         return Estimate(advantages, targets, explained_variance(targets, values[:-1], counted), counted)
 
@@ -79,16 +79,6 @@ class CriticEstimator:
             trace=self._trace,
         )
         return advantages, targets, rollout.valid[:-1]
-
-    @torch.inference_mode()
-    def _values(self, rollout: Rollout) -> Tensor:
-        """Values (T + 1, B), a few turns at a time to keep memory small."""
-        turns = rollout.times.shape[0]
-        values = []
-        for start in range(0, turns, 8):
-            part = {name: v[start : start + 8].flatten(0, 1) for name, v in rollout.central.items()}
-            values.append(self._critic(part).unflatten(0, (-1, rollout.times.shape[1])))
-        return torch.cat(values)
 
     def state(self) -> dict[str, float | None]:
         """The reward rate."""
@@ -149,3 +139,13 @@ def explained_variance(targets: Tensor, values: Tensor, counted: Tensor) -> floa
     """Share of the variance of value targets that values explain, over the `counted` turns; all (T, B)."""
     residual = (targets - values)[counted].var(correction=0)
     return float(1 - residual / targets[counted].var(correction=0).clamp(min=1e-12))
+
+
+@torch.inference_mode()
+def values_of(critic: nn.Module, rollout: Rollout) -> Tensor:
+    """A critic's values (T + 1, B) of a rollout's states, a few turns at a time to keep memory small."""
+    values = []
+    for start in range(0, rollout.times.shape[0], 8):
+        part = {name: v[start : start + 8].flatten(0, 1) for name, v in rollout.central.items()}
+        values.append(critic(part).unflatten(0, (-1, rollout.times.shape[1])))
+    return torch.cat(values)

@@ -13,7 +13,7 @@ from marl_sched.agents.learned.network import PolicyNetwork, slots_of
 from marl_sched.agents.learned.policy import NetworkPolicy
 from marl_sched.agents.registry import create_scheduler, policy_path
 from marl_sched.domain import Domain, get_domain
-from marl_sched.train.config import GaeConfig, ImitationConfig, RunRecord, TrainConfig
+from marl_sched.train.config import GaeConfig, ImitationConfig, RunRecord, StateValueConfig, TrainConfig
 from marl_sched.train.evaluate import Settings, evaluate_scheduler
 
 BEST = "policy.safetensors"
@@ -60,6 +60,8 @@ def knowledge(config: TrainConfig) -> str:
     local = config.view["kind"] != "full"
     if isinstance(config.algorithm, GaeConfig) and local:
         used.append("a critic on the full graph")
+    if isinstance(config.algorithm, StateValueConfig):
+        used.append("a critic that is told the time left")
     if isinstance(config.algorithm, ImitationConfig) and local:
         used.append("the full graph for the teacher")
     return ", ".join(dict.fromkeys(used))

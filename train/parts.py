@@ -30,6 +30,7 @@ from marl_sched.train.config import (
     IppoConfig,
     PolicyConfig,
     RunRecord,
+    StateValueConfig,
     StepBaselineConfig,
     TrainConfig,
 )
@@ -39,6 +40,7 @@ from marl_sched.train.export import save_best
 from marl_sched.train.imitation import Imitation
 from marl_sched.train.learner import Learner, PolicyGradient
 from marl_sched.train.ppo import Ppo
+from marl_sched.train.state_value import StateValue, StateValueBaseline, TimedEpisodes
 from marl_sched.train.validation import Validation
 
 
@@ -95,6 +97,8 @@ def _with_algorithm(config: TrainConfig, length: EpisodeLength) -> tuple[Collect
             return _with_own_critic(config, algorithm, length)
         case StepBaselineConfig() as algorithm:
             return _with_step_baseline(config, algorithm, length)
+        case StateValueConfig() as algorithm:
+            return _with_state_value(config, algorithm, length)
         case ImitationConfig() as algorithm:
             return _with_teacher(config, algorithm, length)
 
@@ -123,6 +127,17 @@ def _with_step_baseline(
     estimator = StepBaseline(discount=algorithm.discount, episodes=algorithm.episodes)
     learner = PolicyGradient(Ppo(_policy(config, env), None, algorithm.ppo), estimator)
     return EpisodeCollector(env, central=False), learner
+
+
+def _with_state_value(
+    config: TrainConfig, algorithm: StateValueConfig, length: EpisodeLength
+) -> tuple[Collector, Learner]:
+    rows = algorithm.instances * algorithm.episodes
+    env = _environment(config, length, rows=rows, episodes=algorithm.episodes)
+    critic = StateValue(env.simulator.graph, **msgspec.structs.asdict(algorithm.critic))
+    estimator = StateValueBaseline(critic, discount=algorithm.discount)
+    learner = PolicyGradient(Ppo(_policy(config, env), critic, algorithm.ppo), estimator)
+    return TimedEpisodes(env, central=False), learner
 
 
 def _with_teacher(config: TrainConfig, algorithm: ImitationConfig, length: EpisodeLength) -> tuple[Collector, Learner]:

@@ -10,7 +10,6 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from marl_sched.agents.hetgat.network import HetGATCritic
 from marl_sched.agents.learned.compaction import compacted
 from marl_sched.agents.learned.network import PolicyNetwork
 from marl_sched.agents.learned.policy import inverse_distribution
@@ -127,7 +126,7 @@ class Ppo:
         config: see PpoConfig.
     """
 
-    def __init__(self, policy: PolicyNetwork, critic: HetGATCritic | None, config: PpoConfig) -> None:
+    def __init__(self, policy: PolicyNetwork, critic: nn.Module | None, config: PpoConfig) -> None:
         self.policy, self.critic, self.config = policy, critic, config
         self.modules: dict[str, nn.Module] = {"policy": policy} | ({"critic": critic} if critic is not None else {})
         self.optimizer = torch.optim.Adam(

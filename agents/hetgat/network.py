@@ -93,7 +93,7 @@ class HetGATNetwork(PolicyNetwork):
 
 
 class HetGATCritic(nn.Module):
-    """A value function that sums one term for each visible node and one for the state.
+    """A value function that sums one term for each visible node of the types `summed` and one for the state.
 
     It sees nothing of a deployed agent's business, so it may be given the full graph and what no node
     carries, such as the time left in the episode.
@@ -102,12 +102,22 @@ class HetGATCritic(nn.Module):
         spec: the metagraph.
         width, heads, layers: sizes of the encoder.
         extra: number of inputs beside the graph, which enter the state's term.
+        summed: node types whose nodes have terms, None: all.
     """
 
-    def __init__(self, spec: GraphSpec, *, width: int = 8, heads: int = 4, layers: int = 2, extra: int = 0) -> None:
+    def __init__(
+        self,
+        spec: GraphSpec,
+        *,
+        width: int = 8,
+        heads: int = 4,
+        layers: int = 2,
+        extra: int = 0,
+        summed: Collection[str] | None = None,
+    ) -> None:
         super().__init__()
         self.spec = spec
-        names = [node.name for node in spec.nodes]
+        names = [node.name for node in spec.nodes] if summed is None else list(summed)
         self.encoder = HetGATEncoder(spec, width=width, heads=heads, layers=layers, outputs=[*names, STATE])
         self.node_terms = nn.ModuleDict({name: nn.Linear(width, 1) for name in names})
         hidden = width * heads

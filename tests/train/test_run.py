@@ -22,6 +22,9 @@ TINY = [
 ]  # fmt: skip
 GAE = [*TINY, "algorithm.instances=4", "algorithm.turns=12", "algorithm.critic.width=2"]
 STEP_BASELINE = [*TINY, "algorithm=step_baseline", "algorithm.instances=2", "algorithm.episodes=2"]
+IPPO = ["algorithm=ippo", *GAE]
+STATE_VALUE = ["algorithm=state_value", *TINY, "algorithm.instances=2", "algorithm.critic.width=2"]
+RANDOM_VIEW = [*GAE, "view=random", "view.staleness_most=3"]
 
 
 class StoppedError(Exception):
@@ -49,7 +52,11 @@ def rows(directory: Path) -> list[dict[str, str]]:
         return [{name: value for name, value in row.items() if name != "seconds"} for row in csv.DictReader(file)]
 
 
-@pytest.mark.parametrize("overrides", [GAE, STEP_BASELINE], ids=["gae", "step_baseline"])
+@pytest.mark.parametrize(
+    "overrides",
+    [GAE, STEP_BASELINE, IPPO, STATE_VALUE, RANDOM_VIEW],
+    ids=["gae", "step_baseline", "ippo", "state_value", "random view"],
+)
 def test_a_resumed_run_ends_as_one_that_never_stopped(
     overrides: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

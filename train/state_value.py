@@ -1,0 +1,74 @@
+"""PPO with a state-based value function, against which figure 6.3 holds the step-based baseline (section 6.5.4).
+
+Whole episodes are played as in algorithm 5. The baseline is what a critic makes of the state node's output and
+of the time left in the episode, which tells how much there is still to earn. It is a network of its own and
+shares no layers with the policy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import torch
+from torch import Tensor, nn
+
+from marl_sched.agents.hetgat.network import HetGATCritic
+from marl_sched.graph import GraphSpec
+from marl_sched.train.advantages import returns_by_time
+from marl_sched.train.collect import Act, EpisodeCollector, Rollout
+from marl_sched.train.estimators import Estimate, explained_variance, values_of
+
+TIME_LEFT = "time_left"
+_UNIT = 100.0  # of the time left and of values, so that a network meets numbers around 1
+
+
+class StateValue(nn.Module):
+    """A value from the state node's output alone and the time left.
+
+    Args:
+        spec: the metagraph.
+        width, heads, layers: sizes of the encoder.
+    """
+
+    def __init__(self, spec: GraphSpec, *, width: int, heads: int, layers: int) -> None:
+        super().__init__()
+        self.critic = HetGATCritic(spec, width=width, heads=heads, layers=layers, extra=1, summed=())
+
+    def forward(self, observation: Mapping[str, Tensor]) -> Tensor:
+        """Values (B,) from an observation's tensors and, named TIME_LEFT, float32 (B,) in simulated time."""
+        return _UNIT * self.critic(observation, observation[TIME_LEFT][:, None] / _UNIT)
+
+
+class TimedEpisodes(EpisodeCollector):
+    """Whole episodes in which the critic, besides what the acting agent sees, is told the time left."""
+
+    def collect(self, act: Act, length: int) -> Rollout:
+        """See EpisodeCollector."""
+        rollout = super().collect(act, length)
+        return replace(rollout, central={**rollout.central, TIME_LEFT: (length - rollout.times).float()})
+
+
+class StateValueBaseline:
+    """Advantages are rewards-to-go less the critic's value; the critic learns the rewards-to-go."""
+
+    def __init__(self, critic: StateValue, *, discount: float) -> None:
+        self._critic, self._discount = critic, discount
+
+    def estimate(self, rollout: Rollout) -> Estimate:
+        """Advantages and value targets."""
+        counted, times = rollout.valid[:-1], rollout.times[:-1]
+        returns = returns_by_time(
+            rollout.rewards, rollout.elapsed, times, counted, discount=self._discount, length=rollout.length
+        )
+        targets = torch.where(counted, returns.gather(0, torch.where(counted, times, 0)), 0.0)
+        values = values_of(self._critic, rollout)[:-1]
+        advantages = torch.where(counted, targets - values, 0.0)
+        return Estimate(advantages, targets, explained_variance(targets, values, counted), counted)
+
+    def state(self) -> dict[str, float | None]:
+        """Nothing."""
+        return {}
+
+    def restore(self, state: dict[str, float | None]) -> None:
+        """Nothing."""
