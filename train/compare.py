@@ -57,7 +57,13 @@ def play_episode(domain: Domain, scheduler: Scheduler, instance: Any, settings: 
 
 
 def read_learning_curve(log: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Minutes and validation scores, float64 (N,) each, of the rows of a training log that were validated.
+    """Minutes and validation scores, float64 (N,) each, of a training log; InvalidFileError if it is none."""
+    seconds, scores = read_curve(log, SECONDS, SCORE)
+    return seconds / 60, scores
+
+
+def read_curve(log: Path, x: str, y: str) -> tuple[np.ndarray, np.ndarray]:
+    """Two columns of a training log, float64 (N,) each, in the rows that have a value of `y`.
 
     Raises InvalidFileError for a file that is not such a log.
     """
@@ -68,18 +74,18 @@ def read_learning_curve(log: Path) -> tuple[np.ndarray, np.ndarray]:
         raise InvalidFileError(log, "", f"a readable file ({error.strerror})") from error
     except UnicodeDecodeError as error:
         raise InvalidFileError(log, f"byte {error.start}", "UTF-8 text") from error
-    minutes, scores = [], []
+    points = []
     for line, row in enumerate(rows, start=2):
-        for column in (SECONDS, SCORE):
+        for column in (x, y):
             if row.get(column) is None:
                 raise InvalidFileError(log, f"line {line}", f"a column {column!r}")
-        if row[SCORE] == "":
+        if row[y] == "":
             continue
         try:
-            minutes.append(float(row[SECONDS]) / 60)
-            scores.append(float(row[SCORE]))
+            points.append((float(row[x]), float(row[y])))
         except ValueError as error:
-            raise InvalidFileError(log, f"line {line}", "numbers", f"{row[SECONDS]}, {row[SCORE]}") from error
-    if not scores:
-        raise InvalidFileError(log, "", "at least one validated row")
-    return np.array(minutes), np.array(scores)
+            raise InvalidFileError(log, f"line {line}", "numbers", f"{row[x]}, {row[y]}") from error
+    if not points:
+        raise InvalidFileError(log, "", f"at least one row with a value of {y!r}")
+    xs, ys = np.array(points).T
+    return xs, ys

@@ -130,6 +130,26 @@ def learning_curves(curves: Mapping[str, tuple[np.ndarray, np.ndarray]], *, meas
     return figure
 
 
+def curves_by_group(curves: Mapping[str, Any]) -> Figure:
+    """Learning curves as marl_sched.train.curves has them: a colour for each group, thin for runs, thick for means."""
+    figure = Figure(figsize=(8.0, 4.6), layout="constrained")
+    axes = figure.add_subplot()
+    for i, (name, group) in enumerate(curves["groups"].items()):
+        colour = _LINES[i % len(_LINES)]
+        for run in group["runs"]:
+            axes.plot(run["x"], run["y"], "-", color=colour, lw=0.9, alpha=0.45)
+        runs = f"{len(group['runs'])} run{'s' if len(group['runs']) > 1 else ''}"
+        axes.plot(group["mean"]["x"], group["mean"]["y"], "-", color=colour, lw=2.4, label=f"{name}, mean of {runs}")
+    axes.set_xlabel({"hours": "simulated hours", "seconds": "seconds of training"}.get(curves["x"], curves["x"]))
+    how = "sampled, in training" if curves["measure"] == "reward_rate" else "on validation instances"
+    smooth = f", mean of {curves['smooth']} points" if curves["smooth"] > 1 else ""
+    axes.set_ylabel(f"M1 {how}{smooth}")
+    _plain(axes)
+    axes.grid(color=_FAINT, lw=0.6)
+    axes.legend(frameon=False, loc="lower right", fontsize=9)
+    return figure
+
+
 def _conditions(results: Mapping[str, Any]) -> str:
     scale = results["scale"] or "given"
     return f"{results['env']}, {results['instances']} {scale} instances x {results['episodes']} episodes"

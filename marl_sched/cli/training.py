@@ -1,4 +1,4 @@
-"""`marl-sched train`, `resume` and `export`: policies learn and are measured."""
+"""`marl-sched train`, `resume`, `export` and `curves`: policies learn and are measured."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ def add_to(app: typer.Typer) -> None:
     app.command(epilog="Example: marl-sched train env=airme view=local view.reach=1 algorithm=gae seed=1")(train)
     app.command(epilog="Example: marl-sched resume runs/airme-local")(resume)
     app.command(epilog="Example: marl-sched export runs/airme-local airme-local-profit --out policies")(export)
+    app.command(epilog="Example: marl-sched curves runs/gae-0 runs/gae-1 runs/ippo-0 --out curves.png")(curves)
 
 
 def train(
@@ -61,3 +62,31 @@ def export(
     for scale, measured in card.scores.items():
         typer.echo(f"{scale}: M1 {measured['M1']:.4f}")
     typer.echo(path)
+
+
+def curves(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN_DIR...", help="Folders of runs.")],
+    out: Annotated[Path, typer.Option("--out", metavar="PNG", help="The picture; its numbers go beside it, as JSON.")],
+    x: Annotated[str, typer.Option("--x", help="updates, hours (simulated) or seconds.")] = "updates",
+    measure: Annotated[
+        str, typer.Option("--measure", help="reward_rate (M1 sampled in training) or validation.")
+    ] = "reward_rate",
+    smooth: Annotated[
+        int | None,
+        typer.Option("--smooth", min=1, help="Points a point is the mean of (default: reward_rate 10, validation 1)."),
+    ] = None,
+    by: Annotated[
+        str, typer.Option("--by", metavar="KEY", help="The key of the configuration that groups runs.")
+    ] = "algorithm.name",
+) -> None:
+    """Draw the learning curves of runs: a thin line for each, a thick one for the mean of a group."""
+    from marl_sched.files import write_json
+    from marl_sched.train.curves import learning_curves
+    from marl_sched.train.plots import curves_by_group, save
+
+    if out.suffix == ".json":
+        raise InvalidOptionError(f"--out: expected a picture such as curves.png, got {out}")
+    options.check_output(out, "--out")
+    numbers = learning_curves(runs, x=x, measure=measure, smooth=smooth, by=by)
+    write_json(out.with_suffix(".json"), numbers)
+    typer.echo(save(curves_by_group(numbers), out))

@@ -159,7 +159,7 @@ def test_a_run_that_fails_leaves_an_older_result_as_it_was(run, tmp_path, monkey
     [
         ("update,loss\n1,2\n", ["line 2", "'seconds'"]),
         ("seconds,validation\n1,much\n", ["line 2", "numbers", "much"]),
-        ("seconds,validation\n1,\n", ["at least one validated row"]),
+        ("seconds,validation\n1,\n", ["at least one row with a value of 'validation'"]),
     ],
 )
 def test_a_training_log_that_is_none_is_refused_before_the_work(run, tmp_path, content, pieces):

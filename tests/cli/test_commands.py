@@ -13,7 +13,7 @@ from marl_sched.cli.app import app as application
 from marl_sched.domain import get_domain
 
 COMMANDS = [
-    "generate", "evaluate", "compare", "bench", "tables", "bound", "train", "resume", "export",
+    "generate", "evaluate", "compare", "bench", "tables", "bound", "train", "resume", "export", "curves",
     "world", "agent", "deploy", "demo", "list", "doctor",
 ]  # fmt: skip
 AIRME = get_domain("airme")
