@@ -99,7 +99,7 @@ def _against_limits(table: Mapping[str, Any]) -> str:
             continue
         rows.append(
             [
-                _name(row),
+                _name(row) + _played_by(row, played),
                 _sees(row, played),
                 played[0]["needs"] or "nothing",
                 *(_against(entry) for entry in entries),
@@ -115,6 +115,12 @@ def _against(entry: Mapping[str, Any]) -> str:
         return _NONE
     low, high = entry["M1"]["ci95"]
     return f"{entry['M1']['iqm']:.4f} [{low:.4f}, {high:.4f}]<br>{_difference(entry['difference'])}"
+
+
+def _played_by(row: Mapping[str, Any], played: Sequence[Mapping[str, Any]]) -> str:
+    """The names of the schedulers below the row's own, where they are others."""
+    names = dict.fromkeys(entry["scheduler"].rpartition("/")[2].removesuffix(".safetensors") for entry in played)
+    return "".join(f"<br>`{name}`" for name in names if name != row["label"])
 
 
 def _sees(row: Mapping[str, Any], played: Sequence[Mapping[str, Any]]) -> str:

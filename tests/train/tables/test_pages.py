@@ -83,7 +83,8 @@ def test_the_page_shows_published_values_what_is_known_and_what_is_missing(resul
     lines = text.splitlines()
     shown = next(line for line in lines if line.startswith("| Condition-based"))
     assert "0.600 ± 0.100<br>*0.400 ± 0.030* | 32.5 ± 7.50<br>*-20.0 ± 1.25*" in shown
-    assert any(line.startswith("| `knowing` | everything | failure model |") for line in lines)
+    assert any(line.startswith("| `knowing`<br>`model-based` | everything | failure model |") for line in lines)
+    assert any(line.startswith("| Condition-based<br>`condition` | everything | nothing |") for line in lines)
     net = [line for line in lines if line.startswith("| net<br>(scheme skip)")]
     assert "local (1, 1, 0): 40 %" in net[1]
     assert "not trained yet" in net[2]  # the table of revenue
