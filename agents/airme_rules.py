@@ -54,6 +54,8 @@ class _Fleet:
 class PriorityRule(ObservationScheduler):
     """Serve the open plane of the highest priority; `priority` gives -inf to planes that are not to be served."""
 
+    heeds_objective = False
+
     def __init__(self, name: str, priority: Callable[[_Fleet], np.ndarray], needs: str = "") -> None:
         self.name, self.needs, self._priority = name, needs, priority
 
@@ -68,6 +70,7 @@ class RandomRule(ObservationScheduler):
     """Any plane that may be chosen or the null plane, all alike."""
 
     name = "random"
+    heeds_objective = False
 
     def choose(self, observation: Observation, uniform: np.ndarray) -> np.ndarray:
         """Targets int64 (B,) by inverse distribution from `uniform` float64 (B,)."""

@@ -26,11 +26,14 @@ class Scheduler(ABC):
         needs: what it uses beyond the acting agent's observation, in words, or "" for nothing;
             printed with every result (for example "failure model").
         simulator_options: options of the simulator that belong to it, where a user does not choose others.
+        heeds_objective: whether its choices may depend on the simulator's objective; if not, one episode gives its
+            scores for every objective.
     """
 
     name: str
     needs: str = ""
     simulator_options: Mapping[str, Any] = MappingProxyType({})
+    heeds_objective: bool = True
 
     def start(self, simulator: TurnSimulator, rows: np.ndarray) -> None:
         """Called after `rows`, bool (B,), began a new episode; planners make their plans here."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -104,10 +105,14 @@ class Cell(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class Job:
-    """A cell to be made; `weights` is where those of a policy are."""
+    """A cell to be made; `weights` is where those of a policy are.
+
+    `besides` are cells that the same episodes give: those of a rule that does not heed the objective, for others.
+    """
 
     inputs: Inputs
     weights: Path | None = None
+    besides: tuple[Play, ...] = ()
 
     @property
     def cost(self) -> float:
@@ -172,12 +177,14 @@ class Cells:
         return path
 
 
-def make(job: Job) -> Cell:
-    """Play or prove one cell."""
-    return _prove(job.inputs) if isinstance(job.inputs, Bound) else _play(job.inputs, job.weights)
+def make(job: Job) -> list[Cell]:
+    """Play or prove a job's cell, and those besides."""
+    if isinstance(job.inputs, Bound):
+        return [_prove(job.inputs)]
+    return _play(job.inputs, job.weights, job.besides)
 
 
-def _play(inputs: Play, weights: Path | None) -> Cell:
+def _play(inputs: Play, weights: Path | None, besides: Sequence[Play]) -> list[Cell]:
     domain = get_domain(inputs.env)
     training = None
     if weights is not None:
@@ -201,17 +208,21 @@ def _play(inputs: Play, weights: Path | None) -> Cell:
     )
     problems = domain.instances(inputs.scale, inputs.instances, inputs.seed)
     scores = evaluate_scheduler(domain, scheduler, problems, settings)
-    m1 = scores.measures[inputs.objective]
-    return Cell(
-        inputs=inputs,
-        M1=_rounded(m1.mean(axis=1)),
-        episode_std=round(float(np.sqrt(m1.var(axis=1).mean())), DECIMALS),
-        visible_share=round(scores.visible_share, DECIMALS),
-        needs=scores.needs,
-        training=training,
-        seconds=round(scores.seconds, 1),
-        revision=source_revision(),
-    )
+    revision = source_revision()
+    return [
+        Cell(
+            inputs=wanted,
+            M1=_rounded(m1.mean(axis=1)),
+            episode_std=round(float(np.sqrt(m1.var(axis=1).mean())), DECIMALS),
+            visible_share=round(scores.visible_share, DECIMALS),
+            needs=scores.needs,
+            training=training,
+            seconds=round(scores.seconds, 1),
+            revision=revision,
+        )
+        for wanted in (inputs, *besides)
+        for m1 in (scores.measures[wanted.objective],)
+    ]
 
 
 def _prove(inputs: Bound) -> Cell:

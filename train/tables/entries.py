@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from marl_sched.agents.cards import read_card
-from marl_sched.agents.registry import SHIPPED
+from marl_sched.agents.registry import SHIPPED, rules
 from marl_sched.train.evaluate import view_as_json
 from marl_sched.train.tables.cells import Bound, Job, Play, digest, weights_sha256
 from marl_sched.train.tables.plan import Line, Plan, Player, Row, Size
@@ -73,7 +75,23 @@ class Entries:
                     untrained[entry.policy] = entry
             elif entry is not None:
                 jobs[digest(entry.inputs)] = entry
-        return sorted(jobs.values(), key=lambda job: job.cost), list(untrained.values())
+        return sorted(self._together(jobs.values()), key=lambda job: job.cost), list(untrained.values())
+
+    def _together(self, jobs: Iterable[Job]) -> list[Job]:
+        """Jobs with those of a rule that does not heed the objective made one."""
+        together: dict[str, Job] = {}
+        for job in jobs:
+            inputs = job.inputs
+            name = digest(inputs)
+            if isinstance(inputs, Play) and job.weights is None and not self._heeds(inputs.scheduler):
+                name = digest(msgspec.structs.replace(inputs, objective=""))
+                if name in together:
+                    job = replace(together[name], besides=(*together[name].besides, inputs))
+            together[name] = job
+        return list(together.values())
+
+    def _heeds(self, rule: str) -> bool:
+        return rules(self.plan.env)[rule]().heeds_objective
 
     @property
     def horizon(self) -> int:

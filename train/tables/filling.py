@@ -19,27 +19,28 @@ from marl_sched.train.tables.cells import Cell, Cells, Job, describe, make
 
 
 def missing(jobs: Iterable[Job], cells: Cells) -> list[Job]:
-    """The jobs whose cells are not there yet, in their order; InvalidFileError for a damaged cell."""
-    return [job for job in jobs if cells.read(job.inputs) is None]
+    """The jobs of which a cell is not there yet, in their order; InvalidFileError for a damaged cell."""
+    return [job for job in jobs if any(cells.read(inputs) is None for inputs in (job.inputs, *job.besides))]
 
 
 def fill(jobs: Iterable[Job], cells: Cells, pool: Executor) -> Iterator[tuple[Job, Cell]]:
-    """Make each job's cell and keep it; yields them as they are finished.
+    """Make each job's cells and keep them; yields the jobs with their own cell as they are finished.
 
     Raises MarlSchedError, with the job's name, for a job that cannot be done or whose process was killed.
     """
     futures = {pool.submit(_attempt, job): job for job in jobs}
     for future in as_completed(futures):
         try:
-            cell = future.result()
+            made = future.result()
         except BrokenExecutor as error:
             job = futures[future]
             raise MarlSchedError(f"{describe(job.inputs)}: a process was killed before it was done") from error
-        cells.write(cell)
-        yield futures[future], cell
+        for cell in made:
+            cells.write(cell)
+        yield futures[future], made[0]
 
 
-def _attempt(job: Job) -> Cell:
+def _attempt(job: Job) -> list[Cell]:
     try:
         return make(job)
     except MarlSchedError as error:  # errors with arguments of their own do not survive the way between processes

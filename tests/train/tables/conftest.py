@@ -106,6 +106,7 @@ def write():
                 needs = "failure model" if inputs.scheduler == "model-based" else ""
                 share = 1.0 if inputs.view["kind"] == "full" else 0.5
                 made = {"M1": SCORES[inputs.scheduler], "visible_share": share, "needs": needs}
-            cells.write(Cell(inputs=inputs, seconds=1.0, revision="", **made))
+            for wanted in (inputs, *job.besides):
+                cells.write(Cell(inputs=wanted, seconds=1.0, revision="", **made))
 
     return write

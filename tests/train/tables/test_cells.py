@@ -75,7 +75,7 @@ def test_the_name_does_not_depend_on_the_order_of_a_views_options():
 
 
 def test_a_cell_holds_what_the_evaluation_of_its_inputs_gives():
-    cell = make(Job(PLAY))
+    (cell,) = make(Job(PLAY))
     settings = Settings(episodes=3, seed=5, view=LocalView(staleness=2), horizon=8, scale="small")
     scores = evaluate_scheduler(AIRME, RULES["condition"](), AIRME.instances("small", 2, 5), settings)
     profit = scores.measures["profit"]
@@ -89,14 +89,14 @@ def test_a_cell_holds_what_the_evaluation_of_its_inputs_gives():
 def test_a_scheme_is_played_as_the_inputs_say():
     single = msgspec.structs.replace(PLAY, view={"kind": "full"}, options={"scheme": "single"}, horizon=24)
     full = msgspec.structs.replace(single, options={})
-    assert make(Job(single)).M1 != make(Job(full)).M1
+    assert make(Job(single))[0].M1 != make(Job(full))[0].M1
 
 
 def test_a_proved_cell_is_not_below_the_bound():
     from marl_sched.agents.airme_bound.relaxation import Relaxation, upper_bounds
 
     found = upper_bounds(Relaxation(AIRME.instances("small", 2, 5), horizon=8), price_vectors=1, evaluations=1)
-    cell = make(Job(BOUND))
+    (cell,) = make(Job(BOUND))
     assert all(kept >= value for kept, value in zip(cell.M1, found.value, strict=True))
     np.testing.assert_allclose(cell.M1, found.value, rtol=0, atol=1.1e-6)
     assert cell.needs == "failure model and clock"
@@ -145,13 +145,28 @@ def test_another_mode_on_the_card_makes_another_cell(entries, plan, trained, tmp
     assert digest(Entries(plan, plan.full, tmp_path).row(row, "profit", "small").inputs) != digest(before.inputs)
 
 
-def test_a_rule_under_the_same_view_is_played_once(entries, trained):
+def test_a_rule_is_played_once_for_all_objectives_and_for_all_that_ask_for_a_view(entries, trained):
     jobs, _ = entries.all()
-    names = [digest(job.inputs) for job in jobs]
+    names = [digest(inputs) for job in jobs for inputs in (job.inputs, *job.besides)]
     assert len(set(names)) == len(names)
-    played = [job.inputs for job in jobs if getattr(job.inputs, "scheduler", "") == "condition"]
-    # tables: two objectives x two scales; views: the full one is in the table of profit on small already
-    assert len(played) == 4 + 2
+    played = [job for job in jobs if getattr(job.inputs, "scheduler", "") == "condition"]
+    # two scales in the tables; of the three views, the full one is in the table of small already
+    assert len(played) == 2 + 2
+    full = [job for job in played if job.inputs.view["kind"] == "full"]
+    assert [(job.inputs.objective, [b.objective for b in job.besides]) for job in full] == [("profit", ["revenue"])] * 2
+
+
+@pytest.mark.parametrize("rule", [name for name, rule in RULES.items() if not rule().heeds_objective])
+def test_rules_that_do_not_heed_the_objective_score_alike_played_for_any(rule):
+    play = msgspec.structs.replace(PLAY, scheduler=rule, horizon=48)
+    other = msgspec.structs.replace(play, objective="availability")
+    _, besides = make(Job(play, besides=(other,)))
+    (alone,) = make(Job(other))
+    assert (besides.inputs, besides.M1, besides.episode_std) == (other, alone.M1, alone.episode_std)
+
+
+def test_the_index_heeds_the_objective():
+    assert {name for name, rule in RULES.items() if rule().heeds_objective} == {"index", "index-without-clock"}
 
 
 def test_jobs_come_cheapest_first(entries, trained):
@@ -183,14 +198,15 @@ def test_a_run_that_was_stopped_goes_on_where_it_was(entries, cells, monkeypatch
     with ThreadPoolExecutor(1) as pool, pytest.raises(KeyboardInterrupt):
         list(fill(jobs[:4], cells, pool))
     kept = {path.stem for path in cells.folder.iterdir()}
-    assert kept == set(made)
-    assert len(kept) == 3
+    assert kept >= set(made)
+    assert len(made) == 3
+    assert missing(jobs, cells) == [job for job in jobs if digest(job.inputs) not in made]
 
     monkeypatch.setattr(filling, "make", make)
     with ThreadPoolExecutor(1) as pool:
         done = [digest(cell.inputs) for _, cell in fill(missing(jobs, cells), cells, pool)]
     assert not kept & set(done)
-    assert kept | set(done) == {digest(job.inputs) for job in jobs}
+    assert set(done) | set(made) == {digest(job.inputs) for job in jobs}
     assert missing(jobs, cells) == []
 
 
@@ -210,7 +226,7 @@ def test_workers_are_gone_after_an_error():
 
     def stopped_at_work():
         with worker_processes(2) as pool:
-            assert pool.submit(make, Job(PLAY)).result().M1 == make(Job(PLAY)).M1
+            assert pool.submit(make, Job(PLAY)).result()[0].M1 == make(Job(PLAY))[0].M1
             pool.submit(make, Job(msgspec.structs.replace(PLAY, horizon=100_000)))
             raise KeyboardInterrupt
 
