@@ -57,13 +57,16 @@ with `stop_share` it terminates when that share of planes is broken. All crews e
 |---|---|---|
 | `scale` | `"small"` | of the generated instances and of the padding; None: pad to `instance` |
 | `instance` | None | an `AirmeInstance` or its file for all episodes; None: each episode draws its own |
-| `view` | `"full"` | or `"local"`, `{"kind": "local", "reach": 1, "comm": 1, "staleness": 0}`, a view object |
+| `view` | `"full"` | or `"local"`, `{"kind": "local", "reach": 1, "comm": 1, "staleness": 0}`, `"random"`, a view object |
 | `objective` | `"profit"` | or `"revenue"`, `"availability"` |
 | `horizon` | 720 | hours |
 | `seed` | 0 | of the episodes until a reset gives another |
 | `failure` | `"density"` | as published, or `"hazard"` |
 | `stop_share` | None | the published early end is 0.8 |
 | `render_mode` | None | `"ansi"`: a fleet board; `"rgb_array"`: the timeline of every plane |
+
+The view `"random"` is another local view in every episode, drawn within its options `reach_most`, `comm_most`,
+`staleness_most` and `fresh_share` (marl_sched.envs.airme.views).
 
 Unknown options raise TypeError. `reset(seed=s)` starts episode 0 of seed s, `reset()` goes on to the next one, with
 a new instance unless one is fixed and with new noise; `reset(options={"instance": ...})` plays that instance once.
