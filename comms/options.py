@@ -49,7 +49,7 @@ class WorldOptions:
     hours: int = 0
     objective: str = ""
     view: str = "full"
-    view_options: Mapping[str, int] = field(default_factory=dict)
+    view_options: Mapping[str, int | float] = field(default_factory=dict)
     run: str = "run"
     listen: str = DEFAULT_ENDPOINT
     deadline: float = 2.0
