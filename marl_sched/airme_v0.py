@@ -57,7 +57,7 @@ with `stop_share` it terminates when that share of planes is broken. All crews e
 |---|---|---|
 | `scale` | `"small"` | of the generated instances and of the padding; None: pad to `instance` |
 | `instance` | None | an `AirmeInstance` or its file for all episodes; None: each episode draws its own |
-| `view` | `"full"` | or `"local"`, `{"kind": "local", "reach": 1, "comm": 1, "staleness": 0}`, `"random"`, a view object |
+| `view` | `"full"` | or `"local"`, `{"kind": "local", "reach": 1, "comm": 1, "staleness": 0}`, `"random"`, an object |
 | `objective` | `"profit"` | or `"revenue"`, `"availability"` |
 | `horizon` | 720 | hours |
 | `seed` | 0 | of the episodes until a reset gives another |

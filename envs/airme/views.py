@@ -8,7 +8,6 @@ What a view lets a crew see in an episode comes down to three numbers, its limit
 from __future__ import annotations
 
 from dataclasses import dataclass
-from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -105,7 +104,7 @@ class RandomView:
         for name, most in bounds.items():
             object.__setattr__(self, name, require_integer(f"view random: {name}", getattr(self, name), 0, most))
         fresh: Any = self.fresh_share  # whatever a caller gave
-        if isinstance(fresh, bool) or not isinstance(fresh, Real) or not 0.0 <= fresh <= 1.0:
+        if isinstance(fresh, bool) or not isinstance(fresh, int | float) or not 0.0 <= fresh <= 1.0:
             raise InvalidOptionError(f"view random: fresh_share: expected a share in [0, 1], got {fresh!r}")
         object.__setattr__(self, "fresh_share", float(fresh))
 
