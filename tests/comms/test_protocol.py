@@ -28,7 +28,15 @@ def assert_same_run(report, reference) -> None:
     assert report["M1"] == reference["M1"]
 
 
-@pytest.mark.parametrize("view", [LOCAL, {"view": "full"}, {"view": "local", "view_options": {"reach": 0, "comm": 2}}])
+@pytest.mark.parametrize(
+    "view",
+    [
+        LOCAL,
+        {"view": "full"},
+        {"view": "local", "view_options": {"reach": 0, "comm": 2}},
+        {"view": "random", "view_options": {"staleness_most": 24, "fresh_share": 0.0}},
+    ],
+)
 @pytest.mark.parametrize("policy", ["random", "condition"])
 def test_distributed_run_equals_the_run_in_process(make_run, in_process, view, policy):
     given = options(**{"view_options": {}, **view})
