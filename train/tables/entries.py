@@ -39,7 +39,7 @@ class Entries:
         """A row's entry; None if it has none for this objective and scale."""
         if not row.plays(objective, scale):
             return None
-        return self._entry(row, row.policy, objective, scale, row.view, row.options)
+        return self._entry(row, row.policy, objective, scale, row.view, row.options, row.episodes.get(scale))
 
     def point(self, line: Line, view: str, scale: str) -> Job | Untrained | None:
         """A line's entry under a view by name; None if it has none."""
@@ -47,7 +47,7 @@ class Entries:
         policy = line.policies.get(view) if line.policies else line.policy
         if line.rule is None and policy is None:
             return None
-        return self._entry(line, policy, section.objective, scale, section.views[view], {})
+        return self._entry(line, policy, section.objective, scale, section.views[view], {}, section.episodes)
 
     def bound(self, objective: str, scale: str) -> Job:
         """The upper bound on a scale."""
@@ -118,6 +118,7 @@ class Entries:
         scale: str,
         view: Mapping[str, Any],
         options: Mapping[str, Any],
+        fewer: int | None,
     ) -> Job | Untrained:
         weights = None
         name = player.rule or ""
@@ -136,7 +137,7 @@ class Entries:
             view=view_as_json(self.plan.domain.make_view(dict(view))),
             options=dict(options),
             instances=self.size.instances,
-            episodes=self.size.episodes,
+            episodes=min(self.size.episodes, fewer or self.size.episodes),
             seed=self.plan.seed,
             horizon=self.horizon,
         )

@@ -26,7 +26,8 @@ def page(results: Mapping[str, Any]) -> str:
     """The whole page."""
     parts = [*_head(results)]
     for objective, table in results["objectives"].items():
-        parts += [f"## {objective.capitalize()}", _published_layout(table), reading_aid(table), _against_limits(table)]
+        parts += [f"## {objective.capitalize()}", _published_layout(table), reading_aid(table)]
+        parts.append(_against_limits(table, results["episodes"]))
     parts += [*_decentralisation(results), *_learned(results), *_untrained(results)]
     return "\n\n".join(parts) + "\n"
 
@@ -85,8 +86,8 @@ def _beside(figures: Mapping[str, Any], measure: str) -> str:
     return "<br>".join(lines) or _NONE
 
 
-def _against_limits(table: Mapping[str, Any]) -> str:
-    """What every row knows, and what it reaches of what can be reached."""
+def _against_limits(table: Mapping[str, Any], episodes: int) -> str:
+    """What every row knows, and what it reaches of what can be reached; `episodes` of those who played all."""
     scales = list(table["scales"])
     heads = ["scheduler", "sees", "knows besides"]
     heads += [f"{scale}: IQM, difference to {table['scales'][scale]['best_rule']}" for scale in scales]
@@ -99,7 +100,7 @@ def _against_limits(table: Mapping[str, Any]) -> str:
             continue
         rows.append(
             [
-                _name(row) + _played_by(row, played),
+                _name(row) + _played_by(row, played) + _fewer(row, episodes),
                 _sees(row, played),
                 played[0]["needs"] or "nothing",
                 *(_against(entry) for entry in entries),
@@ -123,6 +124,16 @@ def _played_by(row: Mapping[str, Any], played: Sequence[Mapping[str, Any]]) -> s
     return "".join(f"<br>`{name}`" for name in names if name != row["label"])
 
 
+def _fewer(row: Mapping[str, Any], episodes: int) -> str:
+    """On which scales a row has played fewer episodes than the others."""
+    found = [
+        f"{entry['episodes']} on {scale}"
+        for scale, entry in row["scales"].items()
+        if "M1" in entry and entry["episodes"] < episodes
+    ]
+    return f"<br>episodes: {', '.join(found)}" if found else ""
+
+
 def _sees(row: Mapping[str, Any], played: Sequence[Mapping[str, Any]]) -> str:
     """The view in words and the share of the graph that it showed on every scale."""
     options = {name: value for name, value in row["view"].items() if name != "kind"}
@@ -139,7 +150,8 @@ def _decentralisation(results: Mapping[str, Any]) -> Iterator[str]:
     yield "## The price of deciding alone"
     yield f"![M1 against the share of the graph that a crew sees]({PICTURE})"
     yield (
-        f"M1 ({section['objective']}) of the same schedulers under views that show less and less. A view is (how far a "
+        f"M1 ({section['objective']}, {section['episodes']} episodes of each instance) of the same schedulers under "
+        "views that show less and less. A view is (how far a "
         "crew sees, how far it hears, how old its picture of others' sectors is). Below each score is what the view "
         "costs that scheduler: the paired difference to itself, or to its sibling, under the full view, with its 95 "
         "percent interval."

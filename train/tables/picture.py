@@ -23,7 +23,7 @@ def price_of_decentralisation(results: Mapping[str, Any]) -> Figure:
             for line in found["lines"]
             if line["points"]
         }
-        panels[f"{results['env']}, {results['instances']} {scale} instances x {results['episodes']} episodes"] = {
+        panels[f"{results['env']}, {results['instances']} {scale} instances x {section['episodes']} episodes"] = {
             "bound": found["bound"],
             "central": (found["central"]["label"], found["central"]["M1"]),
             "lines": lines,

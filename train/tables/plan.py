@@ -56,6 +56,7 @@ class Row(Player, frozen=True, kw_only=True):
         options: more options of the simulator, such as a scheme.
         objectives: in whose tables it stands; None: in all.
         scales: on which scales it plays; None: on all.
+        episodes: scale -> episodes of each instance, where they are fewer than the tables'.
         published: objective -> scale -> the published entry.
         remark: printed below the tables as it is.
     """
@@ -65,6 +66,7 @@ class Row(Player, frozen=True, kw_only=True):
     options: dict[str, Any] = {}
     objectives: list[str] | None = None
     scales: list[str] | None = None
+    episodes: dict[str, Count] = {}
     published: dict[str, dict[str, Published]] = {}
     remark: str = ""
 
@@ -82,9 +84,13 @@ class Line(Player, frozen=True, kw_only=True):
 
 
 class Decentralisation(_Part, frozen=True, kw_only=True):
-    """M1 against the share of the graph that an agent sees; `views` by the names that the page gives them."""
+    """M1 against the share of the graph that an agent sees; `views` by the names that the page gives them.
+
+    `episodes` of each instance, where they are fewer than the tables'.
+    """
 
     objective: str
+    episodes: Count | None = None
     scales: Annotated[list[str], Meta(min_length=1)]
     views: Annotated[dict[str, dict[str, Any]], Meta(min_length=2)]
     lines: Annotated[list[Line], Meta(min_length=1)]

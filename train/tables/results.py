@@ -134,6 +134,7 @@ class Results:
         return {
             "scheduler": getattr(cell.inputs, "scheduler", ""),
             "mode": getattr(cell.inputs, "mode", None),
+            "episodes": getattr(cell.inputs, "episodes", None),
             "M1": self._summary(cell),
             "M2": {"mean": float(gain.mean()), "std": float(gain.std())},
             "difference": paired_difference(scores, against["best"]).as_json(),
@@ -168,7 +169,13 @@ class Results:
                 "central": {"label": best, "M1": central[best]},
                 "lines": lines,
             }
-        return {"objective": section.objective, "views": section.views, "scales": scales}
+        episodes = self._entries.size.episodes
+        return {
+            "objective": section.objective,
+            "episodes": min(episodes, section.episodes or episodes),
+            "views": section.views,
+            "scales": scales,
+        }
 
     def _line(self, line: Line, scale: str, against: Mapping[str, Any]) -> dict[str, Any]:
         views = self._plan.decentralisation.views
