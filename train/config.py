@@ -11,7 +11,7 @@ import inspect
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 from hydra import compose, initialize_config_module
@@ -76,7 +76,11 @@ PolicyConfig = HetGATConfig | DecimaConfig | DeepRMConfig
 
 
 class PpoConfig(_Config, frozen=True, kw_only=True):
-    """Clipped surrogate optimisation (equation 6.8); learning rate and entropy bonus change linearly."""
+    """Clipped surrogate optimisation (equation 6.8); learning rate and entropy bonus change linearly.
+
+    A run that starts from a trained policy must not unlearn it by the errors of a new critic: for the share
+    `critic_alone` of its updates the policy stays as it is, and then learns `policy_rate` times as fast as the critic.
+    """
 
     clip: Positive
     epochs: Count
@@ -87,6 +91,8 @@ class PpoConfig(_Config, frozen=True, kw_only=True):
     final_entropy: NonNegative
     max_gradient: Positive
     keep_least: Annotated[float, Meta(gt=0, le=1)]
+    critic_alone: Share = 0.0
+    policy_rate: Positive = 1.0
 
 
 class _CriticConfig(_Config, frozen=True, kw_only=True):
@@ -131,12 +137,15 @@ class StateValueConfig(_Config, frozen=True, kw_only=True, tag_field="name", tag
 class ImitationConfig(_Config, frozen=True, kw_only=True, tag_field="name", tag="imitation"):
     """Choices scored by a scheduler that knows more; temperature and learning rate change linearly.
 
+    `criterion` is what is optimised: see marl_sched.train.imitation.
+
     Rows play on from update to update, `turns` turns each, with the policy that learns.
     """
 
     instances: Count
     turns: Count
     teacher: str
+    criterion: Literal["cross_entropy", "expected_advantage"] = "cross_entropy"
     epochs: Count
     minibatch: Count
     learning_rate: Positive

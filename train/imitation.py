@@ -6,6 +6,10 @@ the failure model), says what each choice is worth, A(a). The policy learns the 
 softmax(A / temperature) over legal targets by cross-entropy: the colder, the finer the differences that it must
 tell, and the surer the sign of a small advantage. That sign matters more than its size: a plane that is worth
 a little now and left standing is left standing again an hour later.
+
+Where the agent cannot see all that the teacher sees, that is a vote among choices it cannot tell apart. The other
+criterion, for a policy that has learned by the first, maximises what its choice is worth on average,
+sum over a of pi(a) A(a) + temperature x entropy (AggreVaTeD; Sun et al. 2017).
 """
 
 from __future__ import annotations
@@ -72,7 +76,11 @@ class Imitation:
         log_probs = self.policy(batch["observation"]).log_softmax(-1)
         legal = batch["observation"][ACTION_MASK] != 0
         advantages = torch.where(legal, batch["advantage"], -torch.inf)
-        loss = share @ cross_entropy(log_probs, (advantages / temperature).softmax(-1))
+        if self._config.criterion == "cross_entropy":
+            losses = cross_entropy(log_probs, (advantages / temperature).softmax(-1))
+        else:
+            losses = -expected_advantage(log_probs, batch["advantage"], temperature)
+        loss = share @ losses
         self.optimizer.zero_grad()
         loss.backward()
         norm = nn.utils.clip_grad_norm_(self.policy.parameters(), self._config.max_gradient)
@@ -98,3 +106,9 @@ def cross_entropy(log_probs: Tensor, wanted: Tensor) -> Tensor:
     Targets that are not legal have the lowest finite log-probability and are wanted with probability 0.
     """
     return -(wanted * log_probs).sum(-1)
+
+
+def expected_advantage(log_probs: Tensor, advantages: Tensor, temperature: float) -> Tensor:
+    """The mean of finite advantages (N, n_targets) under a policy, and its entropy at a temperature, (N,)."""
+    probs = log_probs.exp()
+    return (probs * advantages).sum(-1) + temperature * cross_entropy(log_probs, probs)

@@ -130,15 +130,17 @@ class Ppo:
         self.policy, self.critic, self.config = policy, critic, config
         self.modules: dict[str, nn.Module] = {"policy": policy} | ({"critic": critic} if critic is not None else {})
         self.optimizer = torch.optim.Adam(
-            [parameter for module in self.modules.values() for parameter in module.parameters()], fused=True
+            [{"params": list(module.parameters())} for module in self.modules.values()], fused=True
         )
 
     def update(self, samples: TensorDict, progress: float, rng: np.random.Generator) -> UpdateReport:
         """Several epochs of minibatches; `progress` in [0, 1] places learning rate and entropy bonus."""
         config = self.config
         entropy_weight = between(config.entropy, config.final_entropy, progress)
-        for group in self.optimizer.param_groups:
-            group["lr"] = between(config.learning_rate, config.final_learning_rate, progress)
+        rate = between(config.learning_rate, config.final_learning_rate, progress)
+        of_policy = 0.0 if progress < config.critic_alone else config.policy_rate
+        for name, group in zip(self.modules, self.optimizer.param_groups, strict=True):
+            group["lr"] = rate * (of_policy if name == "policy" else 1.0)
         reports = []
         for indices in minibatches(samples.shape[0], config.minibatch, config.epochs, rng):
             reports.append(self._step(samples[indices], entropy_weight))

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 import torch
@@ -15,7 +16,7 @@ from marl_sched.envs.torchrl_env import SchedulingTorchRL
 from marl_sched.errors import InvalidOptionError
 from marl_sched.train.collect import InstanceSource, Rollout, SegmentCollector
 from marl_sched.train.config import ImitationConfig
-from marl_sched.train.imitation import Imitation, cross_entropy
+from marl_sched.train.imitation import Imitation, cross_entropy, expected_advantage
 from marl_sched.train.ppo import Sampler
 from marl_sched.train.run import train_from_overrides
 
@@ -60,8 +61,17 @@ def test_cross_entropy_is_that_of_the_wanted_distribution_and_ignores_illegal_ta
     torch.testing.assert_close(cross_entropy(log_probs, wanted), torch.tensor([expected], dtype=torch.float32))
 
 
-def test_a_policy_comes_to_choose_what_its_teacher_would(policy: HetGATNetwork) -> None:
-    learner, rng = Imitation(policy, Oldest(), CONFIG), np.random.default_rng(0)
+def test_what_a_choice_is_worth_is_its_mean_under_the_policy_and_the_entropy_at_its_temperature() -> None:
+    log_probs = torch.tensor([[0.25, 0.75, 0.0]]).log().clamp(min=torch.finfo(torch.float32).min)
+    entropy = -(0.25 * np.log(0.25) + 0.75 * np.log(0.75))
+    expected = torch.tensor([0.25 * 2.0 - 0.75 + 0.1 * entropy], dtype=torch.float32)
+    torch.testing.assert_close(expected_advantage(log_probs, torch.tensor([[2.0, -1.0, 9.0]]), 0.1), expected)
+
+
+@pytest.mark.parametrize("criterion", ["cross_entropy", "expected_advantage"])
+def test_a_policy_comes_to_choose_what_its_teacher_would(policy: HetGATNetwork, criterion: str) -> None:
+    config = msgspec.structs.replace(CONFIG, criterion=criterion)
+    learner, rng = Imitation(policy, Oldest(), config), np.random.default_rng(0)
     played = rollout(policy)
     regrets = [learner.learn(played, 0.0, rng)["regret"] for _ in range(60)]
     assert regrets[-1] < 0.3 * regrets[0]

@@ -3,6 +3,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 import torch
@@ -157,3 +158,24 @@ def test_the_step_baseline_needs_no_critic():
     )
     assert report.value_loss == 0.0
     assert report.entropy > 0
+
+
+def test_a_policy_stays_as_it_is_while_the_critic_learns_alone_and_then_learns_at_its_own_rate() -> None:
+    moved = {}
+    for progress, rate in ((0.05, 1.0), (0.1, 1.0), (0.1, 0.1)):
+        policy, critic = networks()
+        rollout = segment(policy)
+        estimate = CriticEstimator(critic, discount=0.9, trace=0.9, centred=True).estimate(rollout)
+        samples = samples_of(policy, rollout, estimate, 1.0, np.random.default_rng(0))
+        before = [parameter.detach().clone() for module in (policy, critic) for parameter in module.parameters()]
+        config = msgspec.structs.replace(CONFIG, critic_alone=0.1, policy_rate=rate, epochs=1, minibatch=10**6)
+        Ppo(policy, critic, config).update(samples, progress, np.random.default_rng(1))
+        after = [parameter.detach() for module in (policy, critic) for parameter in module.parameters()]
+        n = len(list(policy.parameters()))
+        change = [float((b - a).abs().max()) for a, b in zip(before, after, strict=True)]
+        moved[progress, rate] = max(change[:n]), max(change[n:])
+    assert moved[0.05, 1.0][0] == 0.0
+    assert moved[0.05, 1.0][1] > 0.0
+    # Adam's first step has the length of the learning rate.
+    assert moved[0.1, 0.1][0] == pytest.approx(0.1 * moved[0.1, 1.0][0], rel=1e-2)
+    assert moved[0.1, 0.1][1] == moved[0.1, 1.0][1]
