@@ -43,6 +43,32 @@ lint: $(INSTALLED) ## style, formatting, types
 tables-airme: $(INSTALLED) ## tables 6.2 to 6.4 in docs/results/, only the cells that are missing; QUICK=1: a look, in out/tables/
 	$(BIN)/marl-sched tables --env airme --workers $(WORKERS) $(if $(QUICK),--quick)
 
+# Shipped policies: `make policy-NAME` trains one again, in runs/, and measures it for its card. The same seed on
+# another processor may differ in the last digits of a sum, and then in what is learned from it.
+TRAIN_airme-full-profit := algorithm=imitation updates=500
+TRAIN_airme-full-revenue := algorithm=imitation updates=400 env.objective=revenue
+TRAIN_airme-full-availability := algorithm=imitation updates=400 env.objective=availability
+TRAIN_airme-local-profit := algorithm=imitation updates=400 view=local
+TRAIN_airme-local-revenue := algorithm=imitation updates=400 view=local env.objective=revenue
+TRAIN_airme-local-availability := algorithm=imitation updates=400 view=local env.objective=availability
+TRAIN_airme-any-profit := algorithm=imitation updates=500 view=random
+STALE := view=local view.staleness=12
+
+policy-%: $(INSTALLED) ## trains a shipped policy again and writes it into agents/shipped/
+	$(BIN)/marl-sched train $(TRAIN_$*) run_dir=runs/$*
+	$(BIN)/marl-sched export runs/$* $* --out agents/shipped --episodes 1
+
+# With stale pictures imitation alone is not enough: what is worth doing depends on what the neighbours do.
+policy-airme-stale-profit: $(INSTALLED)
+	$(BIN)/marl-sched train $(STALE) algorithm=imitation updates=400 run_dir=runs/airme-stale-imitation
+	$(BIN)/marl-sched train $(STALE) algorithm=imitation algorithm.criterion=expected_advantage \
+		algorithm.temperature=0.1 algorithm.final_temperature=0.01 algorithm.learning_rate=2e-3 updates=100 \
+		start_from=runs/airme-stale-imitation/policy.safetensors run_dir=runs/airme-stale-worth
+	$(BIN)/marl-sched train $(STALE) algorithm.ppo.critic_alone=0.05 algorithm.ppo.policy_rate=0.1 \
+		algorithm.ppo.entropy=0.0 updates=350 \
+		start_from=runs/airme-stale-worth/policy.safetensors run_dir=runs/airme-stale-profit
+	$(BIN)/marl-sched export runs/airme-stale-profit airme-stale-profit --out agents/shipped --episodes 1
+
 format: $(INSTALLED) ## sort imports and lay out the code
 	$(BIN)/ruff check --select I --fix .
 	$(BIN)/ruff format .
