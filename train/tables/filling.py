@@ -12,6 +12,7 @@ import threading
 from collections.abc import Iterable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
+from dataclasses import replace
 from importlib.util import find_spec
 
 from marl_sched.errors import MarlSchedError
@@ -19,8 +20,19 @@ from marl_sched.train.tables.cells import Cell, Cells, Job, describe, make
 
 
 def missing(jobs: Iterable[Job], cells: Cells) -> list[Job]:
-    """The jobs of which a cell is not there yet, in their order; InvalidFileError for a damaged cell."""
-    return [job for job in jobs if any(cells.read(inputs) is None for inputs in (job.inputs, *job.besides))]
+    """What is left of the jobs, in their order: cells that are there are not made again.
+
+    Raises InvalidFileError for a damaged cell.
+    """
+    return [left for job in jobs if (left := _left(job, cells)) is not None]
+
+
+def _left(job: Job, cells: Cells) -> Job | None:
+    """A job without the cells that are there, None if all are."""
+    besides = tuple(inputs for inputs in job.besides if cells.read(inputs) is None)
+    if cells.read(job.inputs) is None:
+        return replace(job, besides=besides)
+    return replace(job, inputs=besides[0], besides=besides[1:]) if besides else None
 
 
 def fill(jobs: Iterable[Job], cells: Cells, pool: Executor) -> Iterator[tuple[Job, Cell]]:

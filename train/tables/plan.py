@@ -173,7 +173,8 @@ def _check(plan: Plan) -> None:
         _check_player(row, plan.env)
         domain.make_view(row.view)
         objectives += [*(row.objectives or ()), *row.published]
-        scales += [*(row.scales or ()), *(scale for entries in row.published.values() for scale in entries)]
+        scales += [*(row.scales or ()), *row.episodes]
+        scales += [scale for entries in row.published.values() for scale in entries]
     for objective in objectives:
         require("objective of these tables", objective, plan.objectives)
     for scale in [*scales, *plan.scales]:

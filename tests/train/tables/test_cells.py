@@ -210,6 +210,20 @@ def test_a_run_that_was_stopped_goes_on_where_it_was(entries, cells, monkeypatch
     assert missing(jobs, cells) == []
 
 
+def test_an_objective_that_comes_later_does_not_touch_the_cells_of_the_others(entries, cells, write):
+    write(entries, cells)
+    (job,) = [
+        job
+        for job in entries.all()[0]
+        if isinstance(job.inputs, Play) and job.inputs.scheduler == "condition" and job.inputs.scale == "medium"
+    ]
+    (revenue,) = job.besides
+    cells.path(revenue).unlink()
+    assert missing(entries.all()[0], cells) == [Job(revenue)]
+    cells.path(job.inputs).unlink()
+    assert missing(entries.all()[0], cells) == [job]
+
+
 @pytest.mark.slow
 def test_what_cannot_be_made_is_told_by_the_workers_in_full(entries, cells, plan, trained):
     job = entries.row(plan.rows[-1], "profit", "small")

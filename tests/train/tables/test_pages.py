@@ -149,6 +149,10 @@ def test_a_missing_cell_is_named_with_the_command_and_nothing_is_written(entries
         ({"seed": -1}, r"tiny.yaml: seed: expected"),
         ({"scales": ["tiny"]}, "unknown scale"),
         ({"rows": [{"label": "a", "group": "ours", "rule": "nobody"}]}, "unknown rule of 'a' 'nobody'"),
+        (
+            {"rows": [{"label": "a", "group": "ours", "rule": "random", "episodes": {"large": 1}}]},
+            "unknown scale of these tables 'large'",
+        ),
         ({"rows": [{"label": "a", "group": "ours"}]}, "'a': expected exactly one of rule, policy"),
         ({"rows": [{"label": "a", "group": "ours", "rule": "random"}] * 2}, "expected distinct labels"),
         (
