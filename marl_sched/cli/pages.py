@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from marl_sched.cli import options
+from marl_sched.errors import InvalidOptionError
 
 if TYPE_CHECKING:
     from marl_sched.train.tables.cells import Cells, Job
@@ -46,6 +47,8 @@ def tables(
     from marl_sched.train.tables.page import write_pages
     from marl_sched.train.tables.plan import load_plan
 
+    if render and without_policies:
+        raise InvalidOptionError("--render, --without-policies: expected one of them, together nothing is left to do")
     out = out or (QUICK_FOLDER if quick else FOLDER)
     options.check_folder(out)
     plan = load_plan(env)

@@ -81,6 +81,7 @@ def test_drawing_plays_nothing_and_names_the_command_where_a_cell_is_missing(run
         (("--env", "airma"), "unknown environment 'airma'"),
         (("--out", __file__), "is not a folder"),
         (("--workers", 0), "--workers"),
+        (("--render", "--without-policies"), "expected one of them"),
     ],
 )
 def test_what_cannot_be_done_is_refused_in_one_line(run, arguments, message):
