@@ -36,7 +36,7 @@ def learning_curves(
     Args:
         runs: folders of runs.
         x: "updates", "hours" (simulated, over all rows) or "seconds" (wall time).
-        measure: "reward_rate", M1 of the sampling policy in training, or "validation", greedy on fixed instances.
+        measure: "reward_rate", M1 of the sampling policy in training, or "validation", on fixed instances.
         smooth: a point is the mean of so many, itself the last; None: see SMOOTHED.
         by: runs with the same value of this key of their configuration are a group, for example `view.reach`.
 

@@ -3,8 +3,9 @@
     docs/results/airme/0a1b2c3d4e5f6071.json
 
 The hash covers everything that decides the scores: whoever plays (the weights' SHA-256, if it is a policy), what is
-played, and `SCHEMA`, which counts the changes of the simulators and of this format that make old cells void. A
-cell that exists is therefore never played again, and one whose inputs have changed is not found.
+played, and `SCHEMA`, which counts the changes of simulators, rules, bounds, networks and this format that make old
+cells void: code is not hashed, whoever changes what it scores raises the number. A cell that exists is therefore never
+played again, and one whose inputs have changed is not found.
 """
 
 from __future__ import annotations
@@ -126,7 +127,7 @@ class Job:
 
 
 def describe(inputs: Inputs) -> str:
-    """A cell in words, for people who wait for it: `condition, medium, profit, local(reach=1, ...)`."""
+    """A cell in words, for people who wait for it: `condition, medium, profit, view local reach 1, ...`."""
     if isinstance(inputs, Bound):
         return f"the bound, {inputs.scale}, {inputs.objective}"
     view = ", ".join(f"{name} {value}" for name, value in inputs.view.items() if name != "kind")
