@@ -25,6 +25,10 @@ STEP_BASELINE = [*TINY, "algorithm=step_baseline", "algorithm.instances=2", "alg
 IPPO = ["algorithm=ippo", *GAE]
 STATE_VALUE = ["algorithm=state_value", *TINY, "algorithm.instances=2", "algorithm.critic.width=2"]
 RANDOM_VIEW = [*GAE, "view=random", "view.staleness_most=3"]
+IMITATION = [
+    "algorithm=imitation", *(word for word in TINY if ".ppo." not in word), "algorithm.instances=4",
+    "algorithm.turns=12", "algorithm.minibatch=16",
+]  # fmt: skip
 
 
 class StoppedError(Exception):
@@ -54,8 +58,8 @@ def rows(directory: Path) -> list[dict[str, str]]:
 
 @pytest.mark.parametrize(
     "overrides",
-    [GAE, STEP_BASELINE, IPPO, STATE_VALUE, RANDOM_VIEW],
-    ids=["gae", "step_baseline", "ippo", "state_value", "random view"],
+    [GAE, STEP_BASELINE, IPPO, STATE_VALUE, RANDOM_VIEW, pytest.param(IMITATION, marks=pytest.mark.slow)],
+    ids=["gae", "step_baseline", "ippo", "state_value", "random view", "imitation"],
 )
 def test_a_resumed_run_ends_as_one_that_never_stopped(
     overrides: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
