@@ -1,12 +1,14 @@
 """The page: figures worked out by hand from made-up cells, and drawn from cells alone."""
 
 import json
+import shlex
 from pathlib import Path
 
 import pytest
 from scipy import stats
 
 from marl_sched.errors import InvalidFileError, MarlSchedError
+from marl_sched.train.config import load_config
 from marl_sched.train.tables.cells import Cells
 from marl_sched.train.tables.entries import Entries
 from marl_sched.train.tables.page import page, write_pages
@@ -185,6 +187,30 @@ def test_the_list_that_ships_names_no_place_outside_the_repository():
     policies = [player.policy for player in [*plan.rows, *plan.decentralisation.lines] if player.policy]
     assert policies
     assert not [policy for policy in policies if policy.startswith(("/", "~")) or ".." in policy]
+
+
+def test_every_command_of_the_list_that_ships_is_one_that_trains():
+    plan = load_plan("airme")
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    asked = [
+        (row.command.replace("{objective}", objective).replace("{scale}", scale), objective)
+        for row in plan.rows
+        if row.policy is not None
+        for objective in plan.objectives
+        for scale in plan.scales
+        if row.plays(objective, scale)
+    ]
+    asked += [(line.command, plan.decentralisation.objective) for line in plan.decentralisation.lines if line.policy]
+    assert asked
+    for command, objective in dict.fromkeys(asked):
+        match shlex.split(command):
+            case ["marl-sched", "train", *overrides]:
+                assert load_config(overrides).env.objective == objective
+            case ["make", target]:
+                name = target.removeprefix("policy-")
+                assert f"\nTRAIN_{name} := " in makefile or f"\npolicy-{name}: " in makefile, command
+            case _:
+                pytest.fail(f"no way to train a policy: {command!r}")
 
 
 @pytest.mark.parametrize("path", sorted(RESULTS.glob("airme.md")), ids=lambda path: path.stem)
