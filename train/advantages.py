@@ -11,8 +11,6 @@ import torch
 from torch import Tensor
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
-Tensors = dict[str, Tensor]
-
 
 def generalised_advantages(
     rewards: Tensor,

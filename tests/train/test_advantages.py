@@ -100,6 +100,45 @@ def test_one_agents_own_turns_are_the_teams():
     torch.testing.assert_close(own[:2], team)
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_own_turns_agree_with_a_plain_walk_from_turn_to_turn(seed: int):
+    rng = np.random.default_rng(seed)
+    turns, rows, discount, trace = 30, 5, 0.9, 0.8
+    alive = rng.random((turns + 1, rows)) < 0.93
+    valid = alive & (rng.random((turns + 1, rows)) < 0.93)
+    agents = np.where(alive, rng.integers(0, 1 + seed % 4, alive.shape), -1)
+    rewards, elapsed = rng.normal(size=(turns, rows)), rng.integers(0, 4, (turns, rows))
+    values = rng.normal(size=(turns + 1, rows))
+    expected, counted = np.zeros((2, turns, rows)), np.zeros((turns, rows), bool)
+    for t, row in reversed(np.argwhere(valid[:-1]).tolist()):
+        earned, passed, later = 0.0, 0, t
+        while True:
+            earned += discount**passed * rewards[later, row]
+            passed, later = passed + elapsed[later, row], later + 1
+            over = later == turns or not valid[later, row]
+            if over or agents[later, row] == agents[t, row]:
+                break
+        mine = agents[later, row] == agents[t, row]
+        future = values[later, row] if alive[later, row] else 0.0
+        credit = 0.0 if over else trace**passed * expected[0, later, row]
+        counted[t, row] = mine or not alive[later, row]
+        if counted[t, row]:
+            target = earned + discount**passed * (future + credit)
+            expected[:, t, row] = target - values[t, row], target
+    found = own_turn_advantages(
+        torch.from_numpy(np.where(valid[:-1], rewards, NAN)),
+        torch.from_numpy(elapsed),
+        torch.from_numpy(np.where(alive, values, NAN)),
+        torch.from_numpy(agents),
+        torch.from_numpy(valid),
+        torch.from_numpy(alive),
+        discount=discount,
+        trace=trace,
+    )
+    assert found[2].numpy().tolist() == counted.tolist()
+    np.testing.assert_allclose(np.stack([found[0], found[1]]), expected, atol=1e-12)
+
+
 def test_nothing_reaches_over_a_cut_into_the_next_episode():
     # Turn 1 is a cut: its state counts as turn 0's future, what the next episode brings does not.
     advantages, _ = generalised_advantages(
