@@ -13,10 +13,10 @@ from marl_sched.agents.learned.network import PolicyNetwork, slots_of
 from marl_sched.agents.learned.policy import NetworkPolicy
 from marl_sched.agents.registry import create_scheduler, policy_path
 from marl_sched.domain import Domain, get_domain
-from marl_sched.train.config import GaeConfig, ImitationConfig, RunRecord, StateValueConfig, TrainConfig
+from marl_sched.train.config import GaeConfig, ImitationConfig, RunRecord, StateValueConfig, TrainConfig, load_record
 from marl_sched.train.evaluate import Settings, evaluate_scheduler
 
-BEST = "policy.safetensors"
+CONFIG, BEST = "config.json", "policy.safetensors"  # in a run's directory
 
 
 def save_best(network: PolicyNetwork, record: RunRecord, update: int, score: float, directory: Path) -> None:
@@ -80,16 +80,23 @@ def export_policy(
     """Measure a run's best policy on unseen instances of each scale, and write it with those scores to `path`.
 
     `scales` None: all of the domain's whose padded sizes its network can read. Instances and noise are those of
-    `marl-sched evaluate --seed SEED`; `length` is the simulated time of an episode, None: the environment's.
-    Returns the card as written.
+    `marl-sched evaluate --seed SEED`, the simulator's further options those of the run; `length` is the simulated time
+    of an episode, None: the environment's. Returns the card as written.
     """
     network, card = load_network(run_dir / BEST)
+    options = load_record(run_dir / CONFIG).config.env.options
     domain = get_domain(card.domain)
     view = domain.make_view(card.view)
     measured = {}
     for scale in _readable(network, domain) if scales is None else scales:
         settings = Settings(
-            episodes=episodes, seed=seed, view=view, objective=card.objective, horizon=length, scale=scale
+            episodes=episodes,
+            seed=seed,
+            view=view,
+            objective=card.objective,
+            horizon=length,
+            scale=scale,
+            options=options,
         )
         policy = NetworkPolicy(network, mode=card.mode)
         scores = evaluate_scheduler(domain, policy, domain.instances(scale, instances, seed), settings)
@@ -98,6 +105,7 @@ def export_policy(
             "M1": float(means.mean()),
             "std": float(means.std()),
             "visible_share": scores.visible_share,
+            "options": options,
             "instances": instances,
             "episodes": episodes,
             "seed": seed,

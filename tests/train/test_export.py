@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -32,6 +33,22 @@ def test_the_card_holds_what_an_evaluation_with_that_seed_measures(tmp_path: Pat
     assert card.scores["small"]["visible_share"] == pytest.approx(scores.visible_share)
     assert card.scores["validation"]["scale"] == "small"
     assert card.command == "marl-sched train " + " ".join(TINY)
+
+
+def test_a_policy_is_measured_with_the_options_that_it_was_trained_with(tmp_path: Path):
+    single = [*TINY, "+env.options.scheme=single"]
+    run = train_from_overrides([*single, f"run_dir={tmp_path / 'run'}"], quiet=True)
+    card = export_policy(run, tmp_path / "mine.safetensors", scales=["small"], instances=2, episodes=2, seed=5)
+    settings = Settings(episodes=2, seed=5, view=LocalView(), scale="small", options={"scheme": "single"})
+    domain = get_domain("airme")
+    policy = NetworkPolicy.load(tmp_path / "mine.safetensors")
+    one, full = (
+        evaluate_scheduler(domain, policy, domain.instances("small", 2, 5), played).measures["profit"].mean()
+        for played in (settings, replace(settings, options={}))
+    )
+    assert one != pytest.approx(full)
+    assert card.scores["small"]["M1"] == pytest.approx(one)
+    assert card.scores["small"]["options"] == {"scheme": "single"}
 
 
 def test_the_command_writes_a_policy_with_scores_of_every_scale(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
