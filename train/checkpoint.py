@@ -67,7 +67,7 @@ def save_checkpoint(
     tensors |= _learned(learner)
     name = f"checkpoint-{counters.update:06d}.safetensors"
     with replacing(directory / name) as temporary:
-        save_file({key: tensor.contiguous() for key, tensor in tensors.items()}, temporary)
+        save_file({key: tensor.cpu().contiguous() for key, tensor in tensors.items()}, temporary)
     numbers = Numbers(tensors=name, counters=counters, learner=learner.state())
     write_json(directory / NAME, msgspec.to_builtins(numbers))
     for old in directory.glob("checkpoint-*.safetensors"):
@@ -78,7 +78,7 @@ def save_checkpoint(
 def load_checkpoint(
     directory: Path, learner: Learner, expected: Collection[str]
 ) -> tuple[Counters, dict[str, np.ndarray]]:
-    """Put the learner back; the counters and the collector's state, with the `expected` names.
+    """Put the learner back, on its own device; the counters and the collector's state, with the `expected` names.
 
     Raises InvalidFileError for a file that is missing, damaged or of another network.
     """
@@ -120,7 +120,7 @@ def _prepare(learner: Learner) -> None:
     for group in learner.optimizer.param_groups:
         for parameter in group["params"]:
             learner.optimizer.state[parameter] = {
-                "step": torch.zeros((), dtype=torch.float32),
+                "step": torch.zeros((), dtype=torch.float32, device=parameter.device),
                 "exp_avg": torch.zeros_like(parameter),
                 "exp_avg_sq": torch.zeros_like(parameter),
             }

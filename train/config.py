@@ -25,6 +25,7 @@ from marl_sched.agents.cards import Heads, Layers, Mode, Width
 from marl_sched.domain import get_domain
 from marl_sched.errors import InvalidFileError, InvalidOptionError
 from marl_sched.files import read_json
+from marl_sched.train.device import DeviceName
 
 # Arguments of every domain's simulator that other keys of the configuration, or the trainer, decide on.
 _SET_ELSEWHERE = {"instances", "view", "objective", "horizon", "seed", "pad"}
@@ -180,7 +181,10 @@ class ValidationConfig(_Config, frozen=True, kw_only=True):
 
 
 class TrainConfig(_Config, frozen=True, kw_only=True):
-    """A whole run; `configs/train.yaml`. `start_from`: a policy, by name or path, to go on from."""
+    """A whole run; `configs/train.yaml`. `start_from`: a policy, by name or path, to go on from.
+
+    `device`: where networks learn (marl_sched.train.device).
+    """
 
     env: EnvConfig
     view: dict[str, Any]
@@ -192,6 +196,7 @@ class TrainConfig(_Config, frozen=True, kw_only=True):
     seed: Seed
     updates: Count
     threads: Count
+    device: DeviceName = "auto"
     run_dir: str | None
     save_every: Count
 

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from marl_sched.train.advantages import generalised_advantages, own_turn_advantages, step_baseline_advantages
 from marl_sched.train.collect import Rollout
+from marl_sched.train.device import device_of
 
 _RATE_STEP = 0.2  # of the exponential average of the reward rate
 
@@ -143,9 +144,12 @@ def explained_variance(targets: Tensor, values: Tensor, counted: Tensor) -> floa
 
 @torch.inference_mode()
 def values_of(critic: nn.Module, rollout: Rollout) -> Tensor:
-    """A critic's values (T + 1, B) of a rollout's states, a few turns at a time to keep memory small."""
-    values = []
+    """A critic's values (T + 1, B) of a rollout's states, a few turns at a time to keep memory small.
+
+    The critic is asked on its own device, its values come back to the rollout's, the CPU.
+    """
+    values, device = [], device_of(critic)
     for start in range(0, rollout.times.shape[0], 8):
-        part = {name: v[start : start + 8].flatten(0, 1) for name, v in rollout.central.items()}
+        part = {name: v[start : start + 8].flatten(0, 1).to(device) for name, v in rollout.central.items()}
         values.append(critic(part).unflatten(0, (-1, rollout.times.shape[1])))
-    return torch.cat(values)
+    return torch.cat(values).cpu()

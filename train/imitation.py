@@ -24,7 +24,8 @@ from marl_sched.agents.learned.network import PolicyNetwork
 from marl_sched.graph import ACTION_MASK
 from marl_sched.train.collect import Rollout
 from marl_sched.train.config import ImitationConfig
-from marl_sched.train.ppo import between, minibatches, thinned
+from marl_sched.train.device import device_of
+from marl_sched.train.ppo import between, means, minibatches, thinned
 
 LEAST = -10.0  # no choice counts as worse than this, in units of what the best choice is usually worth
 
@@ -46,17 +47,17 @@ class Imitation:
 
     def learn(self, rollout: Rollout, progress: float, rng: np.random.Generator) -> dict[str, float]:
         """Ask the teacher about every turn that is kept, then take gradient steps."""
-        config = self._config
-        samples = self._samples(rollout, rng)
+        config, device = self._config, device_of(self.policy)
+        samples = self._samples(rollout, rng).to(device)
         temperature = between(config.temperature, config.final_temperature, progress)
         for group in self.optimizer.param_groups:
             group["lr"] = between(config.learning_rate, config.final_learning_rate, progress)
         reports = [
-            self._step(samples[indices], temperature)
+            self._step(samples[indices.to(device)], temperature)
             for indices in minibatches(samples.shape[0], config.minibatch, config.epochs, rng)
         ]
         names = ("policy_loss", "regret", "entropy", "gradient")
-        return dict(zip(names, np.mean(reports, axis=0).tolist(), strict=True))
+        return dict(zip(names, means(reports), strict=True))
 
     def _samples(self, rollout: Rollout, rng: np.random.Generator) -> TensorDict:
         samples, names, rows = thinned(self.policy, rollout, rollout.valid[:-1], self._config.keep_least, rng)
@@ -71,7 +72,7 @@ class Imitation:
         samples["advantage"] = scaled.gather(1, names)
         return samples
 
-    def _step(self, batch: TensorDict, temperature: float) -> tuple[float, ...]:
+    def _step(self, batch: TensorDict, temperature: float) -> Tensor:
         share = batch["weight"] / batch["weight"].sum()
         log_probs = self.policy(batch["observation"]).log_softmax(-1)
         legal = batch["observation"][ACTION_MASK] != 0
@@ -89,7 +90,7 @@ class Imitation:
             probs = log_probs.exp()
             regret = share @ (advantages.max(1).values - (probs * batch["advantage"]).sum(-1))
             entropy = share @ cross_entropy(log_probs, probs)
-        return tuple(value.item() for value in (loss, regret, entropy, norm))
+            return torch.stack([loss, regret, entropy, norm])
 
     def state(self) -> dict[str, float | None]:
         """The scale of advantages."""

@@ -26,11 +26,12 @@ class RunLog:
         directory: of the run; holds `progress.csv` and `tensorboard/`.
         updates: of the whole run.
         start: updates done already; rows of later ones, left by a run that was stopped, are dropped.
-        quiet: show no progress bar.
+        device: where the run's networks learn, in words, told once.
+        quiet: show no progress bar, tell nothing.
     """
 
-    def __init__(self, directory: Path, *, updates: int, start: int, quiet: bool = False) -> None:
-        self._path, self._start = directory / "progress.csv", start
+    def __init__(self, directory: Path, *, updates: int, start: int, device: str, quiet: bool = False) -> None:
+        self._path, self._start, self._device = directory / "progress.csv", start, device
         self._writer = SummaryWriter(str(directory / "tensorboard"), purge_step=start)
         self._bar = Progress(
             TextColumn("{task.description}"),
@@ -52,6 +53,7 @@ class RunLog:
             writer.writerows(row for row in rows if int(row["update"]) <= self._start)
         self._file = self._path.open("a", newline="", encoding="utf-8")
         self._table = csv.DictWriter(self._file, COLUMNS)
+        self._bar.console.print(f"training on {self._device}", highlight=False)
         self._bar.start()
         return self
 

@@ -35,6 +35,7 @@ from marl_sched.train.config import (
     TrainConfig,
 )
 from marl_sched.train.curriculum import EpisodeLength
+from marl_sched.train.device import pick_device
 from marl_sched.train.estimators import CriticEstimator, OwnTurns, StepBaseline
 from marl_sched.train.export import save_best
 from marl_sched.train.imitation import Imitation
@@ -83,8 +84,8 @@ def build(record: RunRecord) -> Parts:
     """The parts that a run's configuration names, with freshly drawn networks or those that it starts from."""
     config = record.config
     length = EpisodeLength(**msgspec.structs.asdict(config.curriculum), seed=config.seed)
-    with torch.random.fork_rng():
-        torch.manual_seed(config.seed)
+    with torch.random.fork_rng(devices=[]):
+        torch.default_generator.manual_seed(config.seed)
         collector, learner = _with_algorithm(config, length)
     return Parts(record, collector, learner, length, Validation(config))
 
@@ -105,7 +106,7 @@ def _with_algorithm(config: TrainConfig, length: EpisodeLength) -> tuple[Collect
 
 def _with_critic(config: TrainConfig, algorithm: GaeConfig, length: EpisodeLength) -> tuple[Collector, Learner]:
     env = _environment(config, length, rows=algorithm.instances, episodes=1)
-    critic = HetGATCritic(env.simulator.graph, **msgspec.structs.asdict(algorithm.critic))
+    critic = _critic(config, env, algorithm.critic)
     estimator = CriticEstimator(critic, discount=algorithm.discount, trace=algorithm.trace, centred=algorithm.centred)
     learner = PolicyGradient(Ppo(_policy(config, env), critic, algorithm.ppo), estimator)
     return _segments(config, env, algorithm.turns, length), learner
@@ -113,7 +114,7 @@ def _with_critic(config: TrainConfig, algorithm: GaeConfig, length: EpisodeLengt
 
 def _with_own_critic(config: TrainConfig, algorithm: IppoConfig, length: EpisodeLength) -> tuple[Collector, Learner]:
     env = _environment(config, length, rows=algorithm.instances, episodes=1)
-    critic = HetGATCritic(env.simulator.graph, **msgspec.structs.asdict(algorithm.critic))
+    critic = _critic(config, env, algorithm.critic)
     estimator = OwnTurns(critic, discount=algorithm.discount, trace=algorithm.trace, centred=algorithm.centred)
     learner = PolicyGradient(Ppo(_policy(config, env), critic, algorithm.ppo), estimator)
     return SegmentCollector(env, turns=algorithm.turns, length=length(0), central=False), learner
@@ -134,7 +135,7 @@ def _with_state_value(
 ) -> tuple[Collector, Learner]:
     rows = algorithm.instances * algorithm.episodes
     env = _environment(config, length, rows=rows, episodes=algorithm.episodes)
-    critic = StateValue(env.simulator.graph, **msgspec.structs.asdict(algorithm.critic))
+    critic = StateValue(env.simulator.graph, **msgspec.structs.asdict(algorithm.critic)).to(pick_device(config.device))
     estimator = StateValueBaseline(critic, discount=algorithm.discount)
     learner = PolicyGradient(Ppo(_policy(config, env), critic, algorithm.ppo), estimator)
     return TimedEpisodes(env, central=False), learner
@@ -156,8 +157,15 @@ def _segments(config: TrainConfig, env: SchedulingTorchRL, turns: int, length: E
     return SegmentCollector(env, turns=turns, length=length(0), central=config.view["kind"] != "full")
 
 
+def _critic(config: TrainConfig, env: SchedulingTorchRL, sizes: HetGATConfig) -> HetGATCritic:
+    return HetGATCritic(env.simulator.graph, **msgspec.structs.asdict(sizes)).to(pick_device(config.device))
+
+
 def _policy(config: TrainConfig, env: SchedulingTorchRL) -> PolicyNetwork:
-    """A freshly drawn network, or a copy of the one that the run starts from, which must have the same sizes."""
+    """A freshly drawn network, or a copy of the one that the run starts from, which must have the same sizes.
+
+    Weights are drawn on the CPU, so that a seed's are the same on every device.
+    """
     network = new_network(env.simulator.graph, _sizes(config.policy, env))
     if config.start_from is not None:
         start = policy_path(config.start_from)
@@ -166,7 +174,7 @@ def _policy(config: TrainConfig, env: SchedulingTorchRL) -> PolicyNetwork:
         if first.sizes != network.sizes:
             raise InvalidOptionError(f"train: start_from: expected a network of {network.sizes}, got {first.sizes}")
         network.load_state_dict(first.state_dict())
-    return network
+    return network.to(pick_device(config.device))
 
 
 def _sizes(policy: PolicyConfig, env: SchedulingTorchRL) -> Sizes:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +17,7 @@ from marl_sched.graph import ACTION_MASK
 from marl_sched.train.advantages import normalised
 from marl_sched.train.collect import Rollout
 from marl_sched.train.config import PpoConfig
+from marl_sched.train.device import device_of
 from marl_sched.train.estimators import Estimate
 
 VALUE_WEIGHT = 0.5
@@ -35,10 +36,13 @@ class UpdateReport:
 
 
 class Sampler:
-    """Samples a policy by inverse distribution, as an `Act` for collectors; see marl_sched.train.collect."""
+    """Samples a policy by inverse distribution, as an `Act` for collectors; see marl_sched.train.collect.
+
+    Observations and choices are on the CPU, logits are computed where the network is.
+    """
 
     def __init__(self, network: PolicyNetwork) -> None:
-        self._network = network
+        self._network, self._device = network, device_of(network)
         with torch.inference_mode():
             self._weights = network.weights()
 
@@ -46,7 +50,8 @@ class Sampler:
     def __call__(self, observation: dict[str, Tensor], uniform: np.ndarray) -> tuple[Tensor, Tensor]:
         """Targets int64 (B,) and log-probabilities float32 (B,)."""
         visible, names = _as_read(self._network, observation)
-        log_probs = self._network(visible, self._weights).log_softmax(-1)
+        there = {name: values.to(self._device) for name, values in visible.items()}
+        log_probs = self._network(there, self._weights).log_softmax(-1).cpu()
         picked = torch.from_numpy(inverse_distribution(log_probs.numpy(), uniform))[:, None]
         return names.gather(1, picked).squeeze(1), log_probs.gather(1, picked).squeeze(1)
 
@@ -120,6 +125,8 @@ def policy_loss(
 class Ppo:
     """The optimiser of a policy and, if there is one, its critic, with separate clipping of their gradients.
 
+    Both are on one device, to which the samples of an update are brought at once.
+
     Args:
         policy: observation -> logits (N, n_targets).
         critic: central observation -> values (N,), or None.
@@ -141,19 +148,22 @@ class Ppo:
         of_policy = 0.0 if progress < config.critic_alone else config.policy_rate
         for name, group in zip(self.modules, self.optimizer.param_groups, strict=True):
             group["lr"] = rate * (of_policy if name == "policy" else 1.0)
-        reports = []
-        for indices in minibatches(samples.shape[0], config.minibatch, config.epochs, rng):
-            reports.append(self._step(samples[indices], entropy_weight))
-        return UpdateReport(*np.mean(reports, axis=0).tolist())
+        device = device_of(self.policy)
+        samples = samples.to(device)
+        reports = [
+            self._step(samples[indices.to(device)], entropy_weight)
+            for indices in minibatches(samples.shape[0], config.minibatch, config.epochs, rng)
+        ]
+        return UpdateReport(*means(reports))
 
-    def _step(self, batch: TensorDict, entropy_weight: float) -> tuple[float, ...]:
+    def _step(self, batch: TensorDict, entropy_weight: float) -> Tensor:
         logits, share = self.policy(batch["observation"]), batch["weight"] / batch["weight"].sum()
         losses, ratio, entropies = policy_loss(
             logits, batch["target"], batch["log_prob"], batch["advantage"], self.config.clip
         )
         loss, entropy = share @ losses, share @ entropies
         total = loss - entropy_weight * entropy
-        value_loss = torch.zeros(())
+        value_loss = torch.zeros_like(loss)
         if self.critic is not None:
             values = self.critic(batch.get("central", batch["observation"]))
             value_loss = share @ (values - batch["value_target"]).square()
@@ -167,7 +177,12 @@ class Ppo:
         with torch.no_grad():
             kl = share @ ((ratio - 1) - ratio.log())
             clipped = share @ ((ratio - 1).abs() > self.config.clip).float()
-        return tuple(value.item() for value in (loss, value_loss, entropy, kl, clipped, norms[0]))
+            return torch.stack([loss, value_loss, entropy, kl, clipped, norms[0]])
+
+
+def means(reports: Sequence[Tensor]) -> list[float]:
+    """The mean of each number of the minibatches' reports, float (n,) each, which a GPU hands over all at once."""
+    return torch.stack(tuple(reports)).cpu().double().numpy().mean(axis=0).tolist()
 
 
 def between(start: float, end: float, progress: float) -> float:

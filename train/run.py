@@ -17,6 +17,7 @@ from marl_sched.files import write_json
 from marl_sched.train.checkpoint import Counters
 from marl_sched.train.collect import Rollout
 from marl_sched.train.config import RunRecord, load_config, load_record
+from marl_sched.train.device import described, device_of
 from marl_sched.train.logging import RunLog
 from marl_sched.train.parts import Parts, build
 from marl_sched.train.ppo import Sampler
@@ -42,7 +43,10 @@ def train_from_overrides(overrides: Sequence[str], *, quiet: bool = False) -> Pa
 
 
 def resume(run_dir: str | Path, *, quiet: bool = False) -> Path:
-    """Go on with a run from its last checkpoint, exactly as if it had not stopped."""
+    """Go on with a run from its last checkpoint as if it had not stopped: exactly so on a CPU.
+
+    On a GPU sums are made in no fixed order. A checkpoint is not bound to the device on which it was made.
+    """
     directory = Path(run_dir)
     parts = build(load_record(directory / CONFIG))
     return train(parts, parts.restore(directory), directory, quiet=quiet)
@@ -52,7 +56,8 @@ def train(parts: Parts, counters: Counters, directory: Path, *, quiet: bool = Fa
     """The loop. Everything random in an update is a function of (seed, update, instance number)."""
     config = parts.record.config
     torch.set_num_threads(config.threads)
-    with RunLog(directory, updates=config.updates, start=counters.update, quiet=quiet) as log:
+    device = described(device_of(parts.learner.policy))
+    with RunLog(directory, updates=config.updates, start=counters.update, device=device, quiet=quiet) as log:
         while counters.update < config.updates:
             started = time.perf_counter()
             update = counters.update

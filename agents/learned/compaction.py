@@ -42,7 +42,7 @@ def compacted(
     place: dict[str, Tensor] = {}  # old slot -> new slot or -1, (N, n)
     for name, kept in (slots_needed(spec, observation) if slots is None else slots).items():
         visible = observation[f"{name}_mask"] != 0
-        old = torch.arange(visible.shape[1]).expand(visible.shape)
+        old = torch.arange(visible.shape[1], device=visible.device).expand(visible.shape)
         new = old
         if kept < visible.shape[1]:
             seen = visible.cumsum(1)

@@ -29,7 +29,7 @@ class NetworkPolicy(ObservationScheduler):
     (marl_sched.agents.learned.batches).
 
     Args:
-        network: on the CPU.
+        network: on any device; the copy is on the CPU.
         name: as users type it.
         mode: `greedy` takes the most probable target, ties to the lowest index; `sample` picks by inverse
             distribution with the uniform that it is given.
@@ -45,7 +45,7 @@ class NetworkPolicy(ObservationScheduler):
             )
         self.name, self.mode, self.card = name, mode, card
         self.graph: GraphSpec = network.spec
-        self._network = copy.deepcopy(network).requires_grad_(False)
+        self._network = copy.deepcopy(network).cpu().requires_grad_(False)
         with torch.inference_mode():
             self._weights = self._network.weights()
         sizes = {node.name: 1 for node in self.graph.nodes}
