@@ -15,7 +15,7 @@ import numpy as np
 from marl_sched.errors import InvalidOptionError, require
 from marl_sched.train.compare import read_curve
 from marl_sched.train.config import RunRecord, load_record
-from marl_sched.train.run import CONFIG
+from marl_sched.train.export import CONFIG
 
 SCHEMA = 1
 AXES = {"updates": "update", "hours": "hours", "seconds": "seconds"}  # what may be on the x-axis -> its column

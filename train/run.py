@@ -18,11 +18,11 @@ from marl_sched.train.checkpoint import Counters
 from marl_sched.train.collect import Rollout
 from marl_sched.train.config import RunRecord, load_config, load_record
 from marl_sched.train.device import described, device_of
+from marl_sched.train.export import CONFIG
 from marl_sched.train.logging import RunLog
 from marl_sched.train.parts import Parts, build
 from marl_sched.train.ppo import Sampler
 
-CONFIG = "config.json"
 _SAMPLES = 2  # last word of the seeds that pick and order samples
 
 
