@@ -55,7 +55,7 @@ TRAIN_airme-any-profit := algorithm=imitation updates=500 view=random
 STALE := view=local view.staleness=12
 
 policy-%: $(INSTALLED) ## trains a shipped policy again and writes it into agents/shipped/
-	$(BIN)/marl-sched train $(TRAIN_$*) run_dir=runs/$*
+	$(BIN)/marl-sched train $(or $(TRAIN_$*),$(error no policy is called $*)) run_dir=runs/$*
 	$(BIN)/marl-sched export runs/$* $* --out agents/shipped --episodes 1
 
 # With stale pictures imitation alone is not enough: what is worth doing depends on what the neighbours do.

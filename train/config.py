@@ -92,7 +92,7 @@ class PpoConfig(_Config, frozen=True, kw_only=True):
     final_entropy: NonNegative
     max_gradient: Positive
     keep_least: Annotated[float, Meta(gt=0, le=1)]
-    critic_alone: Share = 0.0
+    critic_alone: Annotated[float, Meta(ge=0, lt=1)] = 0.0
     policy_rate: Positive = 1.0
 
 

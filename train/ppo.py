@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from marl_sched.agents.learned.compaction import compacted
 from marl_sched.agents.learned.network import PolicyNetwork
 from marl_sched.agents.learned.policy import inverse_distribution
+from marl_sched.errors import InvalidOptionError
 from marl_sched.graph import ACTION_MASK
 from marl_sched.train.advantages import normalised
 from marl_sched.train.collect import Rollout
@@ -131,9 +132,13 @@ class Ppo:
         policy: observation -> logits (N, n_targets).
         critic: central observation -> values (N,), or None.
         config: see PpoConfig.
+
+    Raises InvalidOptionError if a critic that is not there is to learn alone.
     """
 
     def __init__(self, policy: PolicyNetwork, critic: nn.Module | None, config: PpoConfig) -> None:
+        if critic is None and config.critic_alone > 0:
+            raise InvalidOptionError(f"ppo: critic_alone: there is no critic to learn alone, got {config.critic_alone}")
         self.policy, self.critic, self.config = policy, critic, config
         self.modules: dict[str, nn.Module] = {"policy": policy} | ({"critic": critic} if critic is not None else {})
         self.optimizer = torch.optim.Adam(

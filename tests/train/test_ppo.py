@@ -12,6 +12,7 @@ from marl_sched.agents.hetgat.network import HetGATCritic, HetGATNetwork
 from marl_sched.domain import get_domain
 from marl_sched.envs.airme.views import LocalView
 from marl_sched.envs.torchrl_env import SchedulingTorchRL
+from marl_sched.errors import InvalidOptionError
 from marl_sched.train.collect import EpisodeCollector, InstanceSource, Rollout, SegmentCollector
 from marl_sched.train.config import PpoConfig
 from marl_sched.train.estimators import CriticEstimator, Estimate, StepBaseline
@@ -179,3 +180,8 @@ def test_a_policy_stays_as_it_is_while_the_critic_learns_alone_and_then_learns_a
     # Adam's first step has the length of the learning rate.
     assert moved[0.1, 0.1][0] == pytest.approx(0.1 * moved[0.1, 1.0][0], rel=1e-2)
     assert moved[0.1, 0.1][1] == moved[0.1, 1.0][1]
+
+
+def test_a_critic_that_is_not_there_cannot_learn_alone() -> None:
+    with pytest.raises(InvalidOptionError, match="critic_alone"):
+        Ppo(networks()[0], None, msgspec.structs.replace(CONFIG, critic_alone=0.1))

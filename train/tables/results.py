@@ -49,7 +49,7 @@ class Results:
             "bound": msgspec.to_builtins(size.bound),
             "reference": self._reference_row().label,
             "objectives": tables,
-            "decentralisation": self._decentralisation(tables[plan.decentralisation.objective]),
+            "decentralisation": self._decentralisation(),
             "untrained": [vars(entry) for entry in self._entries.all()[1]],
         }
         return _rounded(data)
@@ -146,18 +146,15 @@ class Results:
             "cell": digest(cell.inputs),
         }
 
-    def _decentralisation(self, table: Mapping[str, Any]) -> dict[str, Any]:
+    def _decentralisation(self) -> dict[str, Any]:
         """The lines of every scale: points by view, with what the view costs the scheduler that has the full one."""
         section = self._plan.decentralisation
         scales = {}
         for scale in section.scales:
             against = self._scale(section.objective, scale)
             lines = [self._line(line, scale, against) for line in section.lines]
-            seeing_all: list[tuple[str, Any]] = [
-                (row["label"], row["scales"].get(scale, {})) for row in table["rows"] if _is_full(row["view"])
-            ]
             full_views = [name for name, view in section.views.items() if _is_full(view)]
-            seeing_all += [(line["label"], line["points"].get(name, {})) for line in lines for name in full_views]
+            seeing_all = [(line["label"], line["points"].get(name, {})) for line in lines for name in full_views]
             central = {
                 label: float(figures["M1"]["mean"])
                 for label, figures in seeing_all

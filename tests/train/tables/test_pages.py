@@ -76,7 +76,7 @@ def test_a_view_costs_what_it_takes_from_the_same_scheduler_with_the_full_one(en
     assert line["points"]["everything"]["cost"]["mean"] == 0.0
     assert list(learned["points"]) == ["near"]
     assert "cost" not in learned["points"]["near"]
-    assert small["central"] == {"M1": pytest.approx(0.6), "label": "Condition-based"}
+    assert small["central"] == {"M1": pytest.approx(0.6), "label": "condition"}
     assert small["bound"] == pytest.approx(0.85)
 
 
