@@ -53,7 +53,7 @@ def knowledge(config: TrainConfig) -> str:
     if config.start_from is not None:
         first = read_card(policy_path(config.start_from).with_suffix(".json"))
         if first.training_knowledge:
-            used.append(first.training_knowledge)
+            used += first.training_knowledge.split(", ")
     if isinstance(config.algorithm, ImitationConfig):
         teacher = create_scheduler(config.algorithm.teacher, config.env.name)
         used.append(f"imitation of {teacher.name}" + (f" ({teacher.needs})" if teacher.needs else ""))

@@ -131,6 +131,15 @@ def test_a_run_imitates_the_index_then_another_goes_on_from_its_policy(tmp_path)
     assert told == "imitation of index-without-clock (failure model), a critic on the full graph"
 
 
+def test_what_two_runs_in_a_row_have_used_is_told_once(tmp_path) -> None:
+    imitation = [*TINY, "view=local", "algorithm=imitation", "algorithm.instances=4", "algorithm.turns=8"]
+    first = train_from_overrides([*imitation, f"run_dir={tmp_path / 'a'}"], quiet=True)
+    start = f"start_from={first / 'policy.safetensors'}"
+    second = train_from_overrides([*imitation, start, f"run_dir={tmp_path / 'b'}"], quiet=True)
+    told = [read_card(run / "policy.json").training_knowledge for run in (first, second)]
+    assert told[0] == told[1] == "imitation of index-without-clock (failure model), the full graph for the teacher"
+
+
 def test_a_network_of_other_sizes_cannot_be_gone_on_from(tmp_path) -> None:
     with pytest.raises(InvalidOptionError, match="start_from: expected a network of"):
         train_from_overrides([*TINY, "start_from=airme-full-profit", f"run_dir={tmp_path / 'a'}"], quiet=True)
