@@ -187,9 +187,10 @@ def _check(plan: Plan) -> None:
         _check_player(line, plan.env, line.policies)
         for name in line.policies:
             require(f"view of line {line.label!r}", name, views)
-    labels = [row.label for row in plan.rows]
-    if len(set(labels)) < len(labels):
-        raise InvalidOptionError("rows: expected distinct labels")
+    for objective in plan.objectives:
+        labels = [row.label for row in plan.rows if row.objectives is None or objective in row.objectives]
+        if len(set(labels)) < len(labels):
+            raise InvalidOptionError(f"rows: expected distinct labels in the table of {objective}")
     if domain.reference not in [row.rule for row in plan.rows if row.view["kind"] == "full"]:
         raise InvalidOptionError(f"rows: expected one of the rule {domain.reference} with the full view")
 
