@@ -56,7 +56,7 @@ def test_an_unknown_kind_names_the_known_ones():
 
 @pytest.mark.parametrize("given", [3, ["full"], {"reach": 1}, MapView()])
 def test_what_describes_no_view_is_refused(given):
-    with pytest.raises(InvalidOptionError, match="view: expected one of full, local or a view object"):
+    with pytest.raises(InvalidOptionError, match="view: expected one of full, local, random or a view object"):
         AIRME.make_view(given)
 
 
