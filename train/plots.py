@@ -176,7 +176,7 @@ def shares_against_scores(panels: Mapping[str, Mapping[str, Any]], *, measure: s
     """
     labels = list(dict.fromkeys(label for panel in panels.values() for label in panel["lines"]))
     looks = {label: (_LINES[i % len(_LINES)], "osD^vP"[i % 6]) for i, label in enumerate(labels)}
-    figure = Figure(figsize=(1.5 + 4.6 * len(panels), 6.0), layout="constrained")
+    figure = Figure(figsize=(1.5 + 5.4 * len(panels), 6.0), layout="constrained")
     all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
     for axes, (caption, panel) in zip(all_axes, panels.items(), strict=True):
         for label, points in panel["lines"].items():
@@ -201,7 +201,7 @@ def shares_against_scores(panels: Mapping[str, Mapping[str, Any]], *, measure: s
         Line2D([], [], color=_INK, lw=1.3, label="upper bound"),
         Line2D([], [], color=_INK, lw=1.1, ls=":", label="best that sees everything"),
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    figure.legend(handles=handles, loc="outside lower center", ncols=2 * len(panels), frameon=False, fontsize=9)
     return figure
 
 

@@ -23,7 +23,10 @@ def price_of_decentralisation(results: Mapping[str, Any]) -> Figure:
             for line in found["lines"]
             if line["points"]
         }
-        panels[f"{results['env']}, {results['instances']} {scale} instances x {section['episodes']} episodes"] = {
+        panels[
+            f"{results['env']}, {results['instances']} {scale} instances x {section['episodes']} episode"
+            + ("s" if section["episodes"] > 1 else "")
+        ] = {
             "bound": found["bound"],
             "central": (found["central"]["label"], found["central"]["M1"]),
             "lines": lines,
