@@ -137,7 +137,12 @@ class StepBaseline:
 
 
 def explained_variance(targets: Tensor, values: Tensor, counted: Tensor) -> float:
-    """Share of the variance of value targets that values explain, over the `counted` turns; all (T, B)."""
+    """Share of the variance of value targets that values explain, over the `counted` turns; all (T, B).
+
+    0 where no turn is counted, of which there is nothing to explain.
+    """
+    if not counted.any():
+        return 0.0
     residual = (targets - values)[counted].var(correction=0)
     return float(1 - residual / targets[counted].var(correction=0).clamp(min=1e-12))
 

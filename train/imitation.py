@@ -21,6 +21,7 @@ from torch import Tensor, nn
 
 from marl_sched.agents.base import AdvantageScheduler
 from marl_sched.agents.learned.network import PolicyNetwork
+from marl_sched.errors import InvalidOptionError
 from marl_sched.graph import ACTION_MASK
 from marl_sched.train.collect import Rollout
 from marl_sched.train.config import ImitationConfig
@@ -46,7 +47,10 @@ class Imitation:
         self._scale: float | None = None
 
     def learn(self, rollout: Rollout, progress: float, rng: np.random.Generator) -> dict[str, float]:
-        """Ask the teacher about every turn that is kept, then take gradient steps."""
+        """Ask the teacher about every turn that is kept, then take gradient steps.
+
+        Raises InvalidOptionError for a teacher that prefers nothing in the first update.
+        """
         config, device = self._config, device_of(self.policy)
         samples = self._samples(rollout, rng).to(device)
         temperature = between(config.temperature, config.final_temperature, progress)
@@ -65,12 +69,22 @@ class Imitation:
         truth = {name: v[:turns].flatten(0, 1)[rows].numpy() for name, v in rollout.central.items()}
         advantages = self._teacher.advantages(truth)
         if self._scale is None:
-            self._scale = float(advantages.max(axis=1).mean()) or 1.0
+            self._scale = self._usual(advantages)
         scaled = torch.from_numpy(np.maximum(advantages / self._scale, LEAST)).float()
         # A target that the agent may choose but that is taken in truth costs it the hour: as much as waiting.
         scaled = torch.where(torch.from_numpy(truth[ACTION_MASK] != 0), scaled, 0.0)
         samples["advantage"] = scaled.gather(1, names)
         return samples
+
+    def _usual(self, advantages: np.ndarray) -> float:
+        """What the best choice is worth on average, of advantages (N, n_targets): the unit of a run's temperatures."""
+        usual = float(advantages.max(axis=1).mean()) if len(advantages) else 0.0
+        if usual <= 0.0:
+            raise InvalidOptionError(
+                f"algorithm.teacher: to {self._teacher.name} no choice of the first update's {len(advantages)} turns "
+                f"is worth more than doing nothing; expected a teacher that prefers something, or more turns"
+            )
+        return usual
 
     def _step(self, batch: TensorDict, temperature: float) -> Tensor:
         share = batch["weight"] / batch["weight"].sum()

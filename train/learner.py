@@ -10,6 +10,7 @@ import torch
 from torch import nn
 
 from marl_sched.agents.learned.network import PolicyNetwork
+from marl_sched.errors import InvalidOptionError
 from marl_sched.train.collect import Rollout
 from marl_sched.train.estimators import Estimator
 from marl_sched.train.ppo import Ppo, samples_of
@@ -49,8 +50,17 @@ class PolicyGradient:
         self.policy, self.modules, self.optimizer = ppo.policy, ppo.modules, ppo.optimizer
 
     def learn(self, rollout: Rollout, progress: float, rng: np.random.Generator) -> dict[str, float]:
-        """Estimate advantages, then optimise the clipped surrogate."""
+        """Estimate advantages, then optimise the clipped surrogate.
+
+        Raises InvalidOptionError if no turn of the rollout can be learned from, as where a segment is too short for
+        an agent to have two turns of its own (IPPO).
+        """
         estimate = self._estimator.estimate(rollout)
+        if not estimate.counted.any():
+            raise InvalidOptionError(
+                f"algorithm.turns: expected a segment in which turns can be told from what follows them, got one of "
+                f"{len(rollout.targets)} turns of which none can"
+            )
         samples = samples_of(self.policy, rollout, estimate, self._ppo.config.keep_least, rng)
         report = self._ppo.update(samples, progress, rng)
         return {**asdict(report), "explained_variance": estimate.explained_variance}

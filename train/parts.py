@@ -93,9 +93,9 @@ def build(record: RunRecord) -> Parts:
 def _with_algorithm(config: TrainConfig, length: EpisodeLength) -> tuple[Collector, Learner]:
     match config.algorithm:
         case GaeConfig() as algorithm:
-            return _with_critic(config, algorithm, length)
+            return _with_critic(config, algorithm, length, CriticEstimator, central=_hides(config))
         case IppoConfig() as algorithm:
-            return _with_own_critic(config, algorithm, length)
+            return _with_critic(config, algorithm, length, OwnTurns, central=False)
         case StepBaselineConfig() as algorithm:
             return _with_step_baseline(config, algorithm, length)
         case StateValueConfig() as algorithm:
@@ -104,20 +104,19 @@ def _with_algorithm(config: TrainConfig, length: EpisodeLength) -> tuple[Collect
             return _with_teacher(config, algorithm, length)
 
 
-def _with_critic(config: TrainConfig, algorithm: GaeConfig, length: EpisodeLength) -> tuple[Collector, Learner]:
+def _with_critic(
+    config: TrainConfig,
+    algorithm: GaeConfig | IppoConfig,
+    length: EpisodeLength,
+    estimator: type[CriticEstimator],
+    *,
+    central: bool,
+) -> tuple[Collector, Learner]:
     env = _environment(config, length, rows=algorithm.instances, episodes=1)
     critic = _critic(config, env, algorithm.critic)
-    estimator = CriticEstimator(critic, discount=algorithm.discount, trace=algorithm.trace, centred=algorithm.centred)
-    learner = PolicyGradient(Ppo(_policy(config, env), critic, algorithm.ppo), estimator)
-    return _segments(config, env, algorithm.turns, length), learner
-
-
-def _with_own_critic(config: TrainConfig, algorithm: IppoConfig, length: EpisodeLength) -> tuple[Collector, Learner]:
-    env = _environment(config, length, rows=algorithm.instances, episodes=1)
-    critic = _critic(config, env, algorithm.critic)
-    estimator = OwnTurns(critic, discount=algorithm.discount, trace=algorithm.trace, centred=algorithm.centred)
-    learner = PolicyGradient(Ppo(_policy(config, env), critic, algorithm.ppo), estimator)
-    return SegmentCollector(env, turns=algorithm.turns, length=length(0), central=False), learner
+    credit = estimator(critic, discount=algorithm.discount, trace=algorithm.trace, centred=algorithm.centred)
+    learner = PolicyGradient(Ppo(_policy(config, env), critic, algorithm.ppo), credit)
+    return SegmentCollector(env, turns=algorithm.turns, length=length(0), central=central), learner
 
 
 def _with_step_baseline(
@@ -150,11 +149,13 @@ def _with_teacher(config: TrainConfig, algorithm: ImitationConfig, length: Episo
             f"got {algorithm.teacher}"
         )
     teacher.start(env.simulator, np.ones(env.simulator.batch, np.bool_))
-    return _segments(config, env, algorithm.turns, length), Imitation(_policy(config, env), teacher, algorithm)
+    collector = SegmentCollector(env, turns=algorithm.turns, length=length(0), central=_hides(config))
+    return collector, Imitation(_policy(config, env), teacher, algorithm)
 
 
-def _segments(config: TrainConfig, env: SchedulingTorchRL, turns: int, length: EpisodeLength) -> SegmentCollector:
-    return SegmentCollector(env, turns=turns, length=length(0), central=config.view["kind"] != "full")
+def _hides(config: TrainConfig) -> bool:
+    """Whether agents see less than everything, so that the full graph is recorded beside their own."""
+    return config.view["kind"] != "full"
 
 
 def _critic(config: TrainConfig, env: SchedulingTorchRL, sizes: HetGATConfig) -> HetGATCritic:

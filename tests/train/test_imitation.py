@@ -77,6 +77,23 @@ def test_a_policy_comes_to_choose_what_its_teacher_would(policy: HetGATNetwork, 
     assert regrets[-1] < 0.3 * regrets[0]
 
 
+class Idle(Oldest):
+    """Never thinks a plane worth the work."""
+
+    name = "idle"
+
+    def advantages(self, observation):
+        return np.where(np.arange(np.asarray(observation["action_mask"]).shape[1]) == 0, 0.0, -1.0)[None].repeat(
+            len(observation["action_mask"]), 0
+        )
+
+
+def test_a_teacher_that_prefers_nothing_is_refused(policy: HetGATNetwork) -> None:
+    learner = Imitation(policy, Idle(), CONFIG)
+    with pytest.raises(InvalidOptionError, match=r"algorithm\.teacher: to idle no choice of .* turns is worth more"):
+        learner.learn(rollout(policy), 0.0, np.random.default_rng(0))
+
+
 def test_the_teacher_is_asked_about_the_true_state(policy: HetGATNetwork) -> None:
     asked: list[dict[str, np.ndarray]] = []
 

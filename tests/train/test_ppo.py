@@ -15,7 +15,8 @@ from marl_sched.envs.torchrl_env import SchedulingTorchRL
 from marl_sched.errors import InvalidOptionError
 from marl_sched.train.collect import EpisodeCollector, InstanceSource, Rollout, SegmentCollector
 from marl_sched.train.config import PpoConfig
-from marl_sched.train.estimators import CriticEstimator, Estimate, StepBaseline
+from marl_sched.train.estimators import CriticEstimator, Estimate, OwnTurns, StepBaseline
+from marl_sched.train.learner import PolicyGradient
 from marl_sched.train.ppo import Ppo, Sampler, policy_loss, samples_of
 
 CONFIG = PpoConfig(
@@ -185,3 +186,11 @@ def test_a_policy_stays_as_it_is_while_the_critic_learns_alone_and_then_learns_a
 def test_a_critic_that_is_not_there_cannot_learn_alone() -> None:
     with pytest.raises(InvalidOptionError, match="critic_alone"):
         Ppo(networks()[0], None, msgspec.structs.replace(CONFIG, critic_alone=0.1))
+
+
+def test_a_segment_in_which_no_agent_has_two_turns_is_refused() -> None:
+    policy, critic = networks()
+    rollout = SegmentCollector(environment(), turns=1, length=8, central=False).collect(Sampler(policy), 8)
+    learner = PolicyGradient(Ppo(policy, critic, CONFIG), OwnTurns(critic, discount=0.9, trace=0.9, centred=True))
+    with pytest.raises(InvalidOptionError, match=r"algorithm\.turns: .* 1 turns"):
+        learner.learn(rollout, 0.0, np.random.default_rng(0))

@@ -38,15 +38,20 @@ def _left(job: Job, cells: Cells) -> Job | None:
 def fill(jobs: Iterable[Job], cells: Cells, pool: Executor) -> Iterator[tuple[Job, Cell]]:
     """Make each job's cells and keep them; yields the jobs with their own cell as they are finished.
 
-    Raises MarlSchedError, with the job's name, for a job that cannot be done or whose process was killed.
+    Raises MarlSchedError, with the job's name, for a job that cannot be done, and for a worker that was killed: the
+    pool does not tell at which job it was.
     """
     futures = {pool.submit(_attempt, job): job for job in jobs}
+    left = len(futures)
     for future in as_completed(futures):
         try:
             made = future.result()
         except BrokenExecutor as error:
-            job = futures[future]
-            raise MarlSchedError(f"{describe(job.inputs)}: a process was killed before it was done") from error
+            raise MarlSchedError(
+                f"a worker process was killed, perhaps for want of memory; {left} cells are left to make, those that "
+                f"were finished are kept"
+            ) from error
+        left -= 1
         for cell in made:
             cells.write(cell)
         yield futures[future], made[0]

@@ -6,7 +6,8 @@ import os
 import subprocess
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 
 import msgspec
 import numpy as np
@@ -236,7 +237,6 @@ def test_what_cannot_be_made_is_told_by_the_workers_in_full(entries, cells, plan
     assert not cells.folder.exists()
 
 
-@pytest.mark.slow
 def gone(pid: int) -> bool:
     """Whether a process ends within half a minute; its exit code may have been read by the pool's own thread."""
     for _ in range(300):
@@ -248,6 +248,21 @@ def gone(pid: int) -> bool:
     return False
 
 
+class Killed(Executor):
+    """A pool whose worker is killed at once."""
+
+    def submit(self, fn, /, *args, **kwargs):
+        future = Future()
+        future.set_exception(BrokenProcessPool("a child process terminated abruptly"))
+        return future
+
+
+def test_a_killed_worker_is_told_with_the_number_of_cells_left(cells):
+    with pytest.raises(MarlSchedError, match=r"killed.* 2 cells are left"):
+        list(fill([Job(PLAY), Job(msgspec.structs.replace(PLAY, seed=8))], cells, Killed()))
+
+
+@pytest.mark.slow
 def test_workers_are_gone_after_an_error():
     before = set(multiprocessing.active_children())
 
