@@ -14,6 +14,7 @@ import torch
 from marl_sched.agents.cards import source_revision
 from marl_sched.errors import InvalidOptionError
 from marl_sched.files import write_json
+from marl_sched.train.allocation import keep_freed_memory
 from marl_sched.train.checkpoint import Counters
 from marl_sched.train.collect import Rollout
 from marl_sched.train.config import RunRecord, load_config, load_record
@@ -56,6 +57,7 @@ def train(parts: Parts, counters: Counters, directory: Path, *, quiet: bool = Fa
     """The loop. Everything random in an update is a function of (seed, update, instance number)."""
     config = parts.record.config
     torch.set_num_threads(config.threads)
+    keep_freed_memory()
     device = described(device_of(parts.learner.policy))
     with RunLog(directory, updates=config.updates, start=counters.update, device=device, quiet=quiet) as log:
         while counters.update < config.updates:

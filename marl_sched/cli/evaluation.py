@@ -77,8 +77,10 @@ def play(resolved: Resolved, baseline: str | None) -> dict[str, Any]:
     from rich.progress import Progress
 
     from marl_sched.agents.registry import create_scheduler
+    from marl_sched.train.allocation import keep_freed_memory
     from marl_sched.train.evaluate import evaluate
 
+    keep_freed_memory()
     domain = resolved.domain
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:

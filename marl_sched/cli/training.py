@@ -52,12 +52,14 @@ def export(
     ] = None,
 ) -> None:
     """Measure a run's best policy on unseen instances of every scale; write its weights and its card."""
+    from marl_sched.train.allocation import keep_freed_memory
     from marl_sched.train.export import export_policy
 
     if not name or Path(name).name != name or "." in name:
         raise InvalidOptionError(f"NAME: expected a name without dots and slashes, got {name!r}")
     options.check_folder(out)
     path = out / f"{name}.safetensors"
+    keep_freed_memory()
     card = export_policy(run_dir, path, instances=instances, episodes=episodes, seed=seed, length=length)
     for scale, measured in card.scores.items():
         typer.echo(f"{scale}: M1 {measured['M1']:.4f}")

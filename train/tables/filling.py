@@ -16,6 +16,7 @@ from dataclasses import replace
 from importlib.util import find_spec
 
 from marl_sched.errors import MarlSchedError
+from marl_sched.train.allocation import keep_freed_memory
 from marl_sched.train.tables.cells import Cell, Cells, Job, describe, make
 
 
@@ -83,6 +84,7 @@ def worker_processes(workers: int) -> Iterator[Executor]:
 def _begin_work() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process; the parent ends the workers
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    keep_freed_memory()
     if find_spec("torch") is not None:
         import torch
 
