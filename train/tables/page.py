@@ -38,6 +38,7 @@ def _head(results: Mapping[str, Any]) -> Iterator[str]:
     if results["quick"]:
         yield "**Quick look:** few instances and episodes, a loose bound. Figures to keep are made without `--quick`."
     bound = results["bound"]
+    fewer = "; rows that say that they played fewer episodes are held against means over all, with wider intervals"
     yield (
         f"Made by `{results['command']}`: {results['instances']} instances of each scale x {results['episodes']} "
         f"episodes of {results[unit]} {unit}, seed {results['seed']}, the same luck for everybody. This page is "
@@ -48,13 +49,12 @@ def _head(results: Mapping[str, Any]) -> Iterator[str]:
         f"in percent over {results['reference']} on the same instance; ± is the standard deviation over instances of "
         "their means. *In italics*, below: what the dissertation published (tables 6.2 to 6.4), on other instances of "
         "the same distribution. **Difference** is paired, to the best rule on that scale that does not know the "
-        "failure model, with Student's 95 percent interval over instances; rows that say that they played fewer "
-        "episodes are held against means over all, with wider intervals. **IQM** is the interquartile mean of the "
-        "instances with its bootstrap interval. **Way** is how much of the distance from "
-        f"{results['reference']} to the upper bound a scheduler goes. The bound is proved for every instance by "
-        f"`marl-sched bound` ({bound['price_vectors']} price vectors, {bound['evaluations']} evaluations): no "
-        "scheduler expects more, even if it knows the failure model and the clock; a mean over few episodes can pass "
-        "it by luck."
+        f"failure model, with Student's 95 percent interval over instances{fewer if _some_fewer(results) else ''}. "
+        "**IQM** is the interquartile mean of the instances with its bootstrap interval. **Way** is how much of the "
+        f"distance from {results['reference']} to the upper bound a scheduler goes. The bound is proved for every "
+        f"instance by `marl-sched bound` ({bound['price_vectors']} price vectors, {bound['evaluations']} evaluations): "
+        "no scheduler expects more, even if it knows the failure model and the clock; a mean over few episodes can "
+        "pass it by luck."
     )
 
 
@@ -123,6 +123,12 @@ def _played_by(row: Mapping[str, Any], played: Sequence[Mapping[str, Any]]) -> s
     """The names of the schedulers below the row's own, where they are others."""
     names = dict.fromkeys(entry["scheduler"].rpartition("/")[2].removesuffix(".safetensors") for entry in played)
     return "".join(f"<br>`{name}`" for name in names if name != row["label"])
+
+
+def _some_fewer(results: Mapping[str, Any]) -> bool:
+    """Whether any row of the tables has played fewer episodes than the others."""
+    rows = [row for table in results["objectives"].values() for row in table["rows"]]
+    return any(_fewer(row, results["episodes"]) for row in rows)
 
 
 def _fewer(row: Mapping[str, Any], episodes: int) -> str:

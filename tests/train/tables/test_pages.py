@@ -107,6 +107,19 @@ def test_a_remark_of_the_list_stands_below_the_tables(tiny, cells, trained, writ
     assert "## Remarks\n\n- Condition-based: serves by hours alone\n" in page(Results(entries, cells, "").as_json())
 
 
+@pytest.mark.parametrize("episodes", [{}, {"small": 1}])
+def test_rows_that_played_fewer_episodes_are_explained_where_there_are_any(
+    tiny, cells, trained, write, tmp_path, episodes
+):
+    tiny["rows"][1]["episodes"] = episodes
+    plan = as_plan(tiny, "tiny.yaml")
+    entries = Entries(plan, plan.full, tmp_path)
+    write(entries, cells)
+    text = page(Results(entries, cells, "").as_json())
+    assert ("rows that say that they played fewer episodes" in text) == bool(episodes)
+    assert ("episodes: 1 on small" in text) == bool(episodes)
+
+
 def test_a_view_that_shows_too_much_is_not_called_local(entries, cells, trained, write, plan):
     import msgspec
 
