@@ -71,6 +71,7 @@ class RandomRule(ObservationScheduler):
 
     name = "random"
     heeds_objective = False
+    samples = True
 
     def choose(self, observation: Observation, uniform: np.ndarray) -> np.ndarray:
         """Targets int64 (B,) by inverse distribution from `uniform` float64 (B,)."""

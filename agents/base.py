@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from marl_sched.errors import InvalidOptionError
 from marl_sched.graph import ACTION_MASK
 from marl_sched.simulation import TurnSimulator
 
@@ -48,7 +49,13 @@ class Scheduler(ABC):
 
 
 class ObservationScheduler(Scheduler):
-    """A scheduler that needs only the acting agent's observation and, to sample, one uniform."""
+    """A scheduler that needs only the acting agent's observation and, to sample, one uniform.
+
+    Attributes:
+        samples: whether it chooses by chance, so that its choice depends on the uniform.
+    """
+
+    samples: bool = False
 
     @abstractmethod
     def choose(self, observation: Mapping[str, np.ndarray], uniform: np.ndarray) -> np.ndarray:
@@ -59,17 +66,20 @@ class ObservationScheduler(Scheduler):
         agents = simulator.acting
         return self.choose(simulator.observe(agents), simulator.policy_noise(agents))
 
-    def act(self, observation: Mapping[str, np.ndarray], uniform: float = 0.5) -> int:
+    def act(self, observation: Mapping[str, np.ndarray], uniform: float | None = None) -> int:
         """One agent's choice from its own observation without batch axis, as PettingZoo gives it.
 
         Accepts the face's `{"observation": ..., "action_mask": ...}` or the flat dict. `uniform` in [0, 1)
-        picks by inverse distribution; greedy schedulers ignore it.
+        picks by inverse distribution, so a scheduler that samples must be given one, drawn by the caller; others
+        ignore it. Raises InvalidOptionError where it is missing.
         """
+        if uniform is None and self.samples:
+            raise InvalidOptionError(f"{self.name} samples: act(observation, uniform): expected a number in [0, 1)")
         flat: dict[str, np.ndarray] = dict(observation.get("observation", observation))
         if ACTION_MASK not in flat:
             flat[ACTION_MASK] = observation[ACTION_MASK]
         batched = {name: np.asarray(value)[None] for name, value in flat.items()}
-        return int(self.choose(batched, np.array([uniform]))[0])
+        return int(self.choose(batched, np.array([uniform or 0.0]))[0])
 
 
 class AdvantageScheduler(ObservationScheduler):

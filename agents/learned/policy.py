@@ -44,6 +44,7 @@ class NetworkPolicy(ObservationScheduler):
                 f"mode of policy {name}: expected one of {', '.join(get_args(Mode))}, got {mode!r}"
             )
         self.name, self.mode, self.card = name, mode, card
+        self.samples = mode == "sample"
         self.graph: GraphSpec = network.spec
         self._network = copy.deepcopy(network).cpu().requires_grad_(False)
         with torch.inference_mode():

@@ -60,6 +60,7 @@ class RandomRule(ObservationScheduler):
     """Any legal task, all alike, whether it can start at once or not; waits only when there is none."""
 
     name = "random"
+    samples = True
 
     def choose(self, observation: Observation, uniform: np.ndarray) -> np.ndarray:
         """Targets int64 (B,) by inverse distribution from `uniform` float64 (B,)."""

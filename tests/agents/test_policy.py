@@ -148,3 +148,10 @@ def test_rows_that_are_over_get_0_and_change_no_other_choice():
     targets = policy.decide(simulator)
     assert (targets[~acting] == 0).all()
     assert (targets[acting] == whole[acting]).all()
+
+
+def test_a_policy_that_samples_wants_a_uniform_and_a_greedy_one_does_not(network, observation):
+    row = row_of(observation, 0)
+    with pytest.raises(InvalidOptionError, match=r"unsaved samples: act\(observation, uniform\)"):
+        NetworkPolicy(network, mode="sample").act(row)
+    assert NetworkPolicy(network).act(row) == NetworkPolicy(network).act(row, uniform=0.9)
