@@ -93,6 +93,17 @@ def load_policy(name_or_path: str | Path, *, mode: Mode | None = None, graph: Gr
     return NetworkPolicy.load(path, mode=mode, graph=graph)
 
 
+def card_of(name_or_path: str | Path, domain: Domain | str) -> PolicyCard | None:
+    """What a trained policy's card says, without loading it; None for a rule.
+
+    Raises UnknownNameError for a name that nobody has, InvalidFileError for a damaged card.
+    """
+    domain_name = domain if isinstance(domain, str) else domain.name
+    if str(name_or_path) in rules(domain_name):
+        return None
+    return read_card(policy_path(name_or_path).with_suffix(".json"))
+
+
 def policy_path(name_or_path: str | Path) -> Path:
     """Where a policy's weights or card are: a path as it is, a shipped name in its folder.
 

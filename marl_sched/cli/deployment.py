@@ -134,12 +134,17 @@ def deploy(
     json: Json = None,
 ) -> None:
     """Start the plant and one process for each agent, watch over them, and report what they did."""
+    from marl_sched.agents.registry import card_of
     from marl_sched.comms.launcher import deploy as launch
     from marl_sched.comms.options import DeployOptions
+    from marl_sched.domain import get_domain
 
-    chosen = DeployOptions(
-        world=plant.world_options(listen, json), policy=policy, agent_policies=_by_agent(agent_policy or [])
-    )
+    by_agent = _by_agent(agent_policy or [])
+    chosen = DeployOptions(world=plant.world_options(listen, json), policy=policy, agent_policies=by_agent)
+    domain = get_domain(plant.env)
+    view = domain.view(chosen.world.view, **chosen.world.view_options)
+    for name in dict.fromkeys([policy, *by_agent.values()]):
+        options.tell_of_training(name, card_of(name, domain), view, plant.objective or domain.objectives[0])
     with progress_bar() as tell:
         report = launch(chosen, tell)
     print_report(report)

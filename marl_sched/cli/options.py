@@ -12,6 +12,7 @@ import typer
 from marl_sched.errors import InvalidFileError, InvalidOptionError
 
 if TYPE_CHECKING:
+    from marl_sched.agents.cards import PolicyCard
     from marl_sched.domain import Domain
 
 Env = Annotated[str, typer.Option("--env", help="The environment; `marl-sched list` shows all.")]
@@ -77,6 +78,32 @@ def warn_of_impossible(domain: Domain, instances: Mapping[str, Any]) -> None:
     for caption, instance in instances.items():
         if reasons := domain.impossibilities(instance):
             typer.echo(f"warning: {caption}: no schedule can be feasible: {'; '.join(reasons)}", err=True)
+
+
+def tell_of_training(name: str, card: PolicyCard | None, view: Any, objective: str) -> None:
+    """Say on stderr if a policy was trained to see or to want something else than it is going to.
+
+    `card` None: it is no trained policy. One that learned under random views is meant for every view.
+    """
+    if card is None:
+        return
+    from marl_sched.train.evaluate import view_as_json
+
+    trained, now = card.view, view_as_json(view)
+    told = (
+        []
+        if trained == now or trained["kind"] == "random"
+        else [f"view {_words(trained)}, it plays with {_words(now)}"]
+    )
+    told += [] if card.objective == objective else [f"{card.objective}, it plays for {objective}"]
+    for difference in told:
+        typer.echo(f"note: {name} was trained for {difference}", err=True)
+
+
+def _words(view: Mapping[str, Any]) -> str:
+    """`local (reach 1, comm 1, staleness 0)`."""
+    details = ", ".join(f"{name} {value}" for name, value in view.items() if name != "kind")
+    return f"{view['kind']} ({details})" if details else str(view["kind"])
 
 
 def check_output(path: Path | None, option: str = "--json") -> None:

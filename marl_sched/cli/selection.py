@@ -74,6 +74,9 @@ class Selection:
             options=own,
         )
         schedulers = create_schedulers(domain, self.schedulers)
+        objective = str(settings.filled_in(domain).objective)
+        for name, scheduler in schedulers.items():
+            options.tell_of_training(name, getattr(scheduler, "card", None), settings.view, objective)
         instances, scale = options.load_instances(domain, self.instances, self.scale, self.seed)
         options.warn_of_impossible(domain, {f"instance {i}": instance for i, instance in enumerate(instances)})
         return Resolved(domain, schedulers, instances, replace(settings, scale=scale))

@@ -201,3 +201,13 @@ def test_a_defect_keeps_its_traceback(monkeypatch):
     monkeypatch.setattr("marl_sched.domain.get_domain", fail)
     with pytest.raises(ZeroDivisionError):
         app.run(["evaluate", "--schedulers", "condition"])
+
+
+def test_a_policy_that_plays_what_it_was_not_trained_for_is_told_once_and_only_then(run):
+    few = ("--instances", "1", "--episodes", "1", "--hours", "3", "--schedulers")
+    done = run("evaluate", *few, "airme-local-profit,condition", "--objective", "revenue")
+    assert done.err.splitlines() == [
+        "note: airme-local-profit was trained for view local (reach 1, comm 1, staleness 0), it plays with full",
+        "note: airme-local-profit was trained for profit, it plays for revenue",
+    ]
+    assert run("evaluate", *few, "airme-local-profit,airme-any-profit", "--view", "local").err == ""
