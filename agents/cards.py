@@ -170,14 +170,20 @@ def check_graph(path: str | Path, card: PolicyCard, graph: GraphSpec) -> None:
 
 
 def source_revision() -> str:
-    """The git commit of the running source, with `-dirty` after it if files differ, or "" outside a checkout."""
-    here = Path(__file__).resolve().parent
-    command = ["git", "-C", str(here), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    """The git commit of the running source, with `-dirty` after it if files differ, or "" outside a checkout.
+
+    A package that is installed inside somebody else's checkout is not of it.
+    """
+    here = Path(__file__).resolve()
+    commands = (
+        ["git", "-C", str(here.parent), "ls-files", "--error-unmatch", here.name],
+        ["git", "-C", str(here.parent), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"],
+    )
     try:
-        found = subprocess.run(command, capture_output=True, text=True, check=False)
+        found = [subprocess.run(command, capture_output=True, text=True, check=False) for command in commands]
     except FileNotFoundError:  # git itself is not installed
         return ""
-    return found.stdout.strip() if found.returncode == 0 else ""
+    return found[1].stdout.strip() if all(done.returncode == 0 for done in found) else ""
 
 
 def _features(graph: GraphSpec) -> dict[str, tuple[str, ...]]:

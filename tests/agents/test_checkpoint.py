@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from marl_sched.agents import cards
 from marl_sched.agents.cards import PolicyCard, check_graph, read_card, source_revision
 from marl_sched.agents.hetgat.network import HetGATNetwork
 from marl_sched.agents.learned.checkpoint import load_network, save_network
@@ -251,3 +253,18 @@ def test_a_policy_of_another_domain_is_refused_by_its_card(saved):
     simulator = murse.simulator(murse.instances("small", 1, 0))
     with pytest.raises(InvalidFileError, match=r"^mine\.json: "):
         NetworkPolicy.load(saved).decide(simulator)
+
+
+def test_a_package_inside_somebody_elses_checkout_has_no_revision(tmp_path, monkeypatch):
+    for command in (
+        ["init", "-q"],
+        ["-c", "user.name=a", "-c", "user.email=a", "commit", "-q", "--allow-empty", "-m", "x"],
+    ):
+        subprocess.run(["git", "-C", str(tmp_path), *command], check=True)
+    installed = tmp_path / "site-packages" / "cards.py"
+    installed.parent.mkdir()
+    installed.touch()
+    monkeypatch.setattr(cards, "__file__", str(installed))
+    assert source_revision() == ""
+    subprocess.run(["git", "-C", str(tmp_path), "add", "--", str(installed)], check=True)
+    assert len(source_revision().removesuffix("-dirty")) == 40
