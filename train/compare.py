@@ -7,6 +7,7 @@ played again, which counter-based randomness makes the same one.
 from __future__ import annotations
 
 import csv
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -40,8 +41,14 @@ def draw_timelines(path: Path, domain: Domain, episodes: Mapping[str, TurnSimula
 
 
 def draw_learning_curves(path: Path, logs: Iterable[Path]) -> Path:
-    """The learning curves of training logs, each named after its run's folder, as a picture; its path."""
-    curves = {log.absolute().parent.name: read_learning_curve(log) for log in logs}
+    """The learning curves of training logs as a picture; its path.
+
+    Each is named after its run's folder, or as it was given where folders of several have the same name. Raises
+    InvalidFileError for what is no log.
+    """
+    folders = {log: log.absolute().parent.name for log in logs}
+    often = Counter(folders.values())
+    curves = {str(log) if often[name] > 1 else name: read_learning_curve(log) for log, name in folders.items()}
     return plots.save(plots.learning_curves(curves), path)
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import inspect
 import shlex
 from collections.abc import Sequence
+from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -201,21 +202,41 @@ class TrainConfig(_Config, frozen=True, kw_only=True):
     save_every: Count
 
     def directory(self) -> str:
-        """Where the run is written."""
-        view = self.view["kind"]
-        return self.run_dir or f"runs/{self.env.name}-{view}-{self.env.objective}-seed{self.seed}"
+        """Where the run is written; by default after what most runs differ in."""
+        view = "-".join(str(value) for value in self.view.values())
+        network, algorithm = (type(part).__struct_config__.tag for part in (self.policy, self.algorithm))
+        names = (self.env.name, view, self.env.objective, network, algorithm, f"seed{self.seed}")
+        return self.run_dir or f"runs/{'-'.join(str(name) for name in names)}"
 
     def make_view(self) -> Any:
         """The domain's view object that `view` describes."""
         return get_domain(self.env.name).make_view(self.view)
 
 
+class Start(_Config, frozen=True, kw_only=True):
+    """The policy that a run goes on from, as its card had it when the run began."""
+
+    weights_sha256: str
+    command: str
+    knowledge: str
+
+
 class RunRecord(_Config, frozen=True, kw_only=True):
-    """`config.json` of a run: the configuration, the overrides that gave it, the source that it runs on."""
+    """`config.json` of a run: the configuration, the overrides that gave it, the source that it runs on.
+
+    `start` belongs to `start_from`, `resumed_on` are further revisions of the source, on which it went on later.
+    """
 
     config: TrainConfig
     overrides: list[str]
     revision: str
+    start: Start | None = None
+    resumed_on: list[str] = []
+
+    @property
+    def source(self) -> str:
+        """Every revision of the source that the run has run on, in their order."""
+        return ", then ".join([self.revision, *self.resumed_on])
 
     @property
     def command(self) -> str:
@@ -263,6 +284,12 @@ def load_record(path: Path) -> RunRecord:
 def _checked(config: TrainConfig) -> TrainConfig:
     """Look up every name in the registry of domains."""
     domain = get_domain(config.env.name)
+    groups = {path.name.removesuffix(".yaml") for path in files("marl_sched.configs").joinpath("env").iterdir()}
+    if config.env.name not in groups:
+        raise InvalidOptionError(
+            f"train: env.name: {config.env.name} cannot be learned yet, as there is no file of that name in "
+            f"configs/env; known: {', '.join(sorted(groups))}"
+        )
     for scale in config.env.scales:
         domain.require_scale(scale)
     domain.require_objective(config.env.objective)

@@ -38,7 +38,8 @@ def learning_curves(
         x: "updates", "hours" (simulated, over all rows) or "seconds" (wall time).
         measure: "reward_rate", M1 of the sampling policy in training, or "validation", on fixed instances.
         smooth: a point is the mean of so many, itself the last; None: see SMOOTHED.
-        by: runs with the same value of this key of their configuration are a group, for example `view.reach`.
+        by: runs with the same value of this key of their configuration are a group, for example `view.reach`. The
+            algorithm of `algorithm=reinforce` is step_baseline, with other settings; `policy.name` tells them apart.
 
     Returns `{"schema", "x", "measure", "smooth", "by", "groups": {NAME: {"mean": {"x": [...], "y": [...]}, "runs":
     [{"run", "seed", "x": [...], "y": [...]}]}}}`. A group's mean is over its runs, on the points of the run that has

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import msgspec
 
-from marl_sched.agents.cards import PolicyCard, read_card
+from marl_sched.agents.cards import PolicyCard
 from marl_sched.agents.learned.checkpoint import load_network, save_network
 from marl_sched.agents.learned.network import PolicyNetwork, slots_of
 from marl_sched.agents.learned.policy import NetworkPolicy
-from marl_sched.agents.registry import create_scheduler, policy_path
+from marl_sched.agents.registry import create_scheduler
 from marl_sched.domain import Domain, get_domain
-from marl_sched.train.config import GaeConfig, ImitationConfig, RunRecord, StateValueConfig, TrainConfig, load_record
+from marl_sched.train.config import GaeConfig, ImitationConfig, RunRecord, StateValueConfig, load_record
 from marl_sched.train.evaluate import Settings, evaluate_scheduler
 
 CONFIG, BEST = "config.json", "policy.safetensors"  # in a run's directory
@@ -23,12 +23,14 @@ def save_best(network: PolicyNetwork, record: RunRecord, update: int, score: flo
     """Write `policy.safetensors` and its card into the run's directory; `score` is M1 on the validation set."""
     config = record.config
     validation = config.validation
+    domain = get_domain(config.env.name)
     measured = {
         "scale": config.env.scales[0],
         "M1": score,
         "instances": validation.instances,
         "episodes": validation.episodes,
         "seed": validation.seed,
+        domain.unit: validation.length or domain.default_horizon,
         "update": update,
     }
     card = PolicyCard(
@@ -38,22 +40,19 @@ def save_best(network: PolicyNetwork, record: RunRecord, update: int, score: flo
         graph=network.spec,
         sizes=network.sizes,
         command=record.command,
-        git_hash=record.revision,
+        git_hash=record.source,
         seed=config.seed,
         scores={"validation": measured},
-        training_knowledge=knowledge(config),
+        training_knowledge=knowledge(record),
         mode=validation.mode,
     )
     save_network(directory / BEST, network, card)
 
 
-def knowledge(config: TrainConfig) -> str:
+def knowledge(record: RunRecord) -> str:
     """What a run uses beyond the policy's view, the runs that it goes on from included."""
-    used = []
-    if config.start_from is not None:
-        first = read_card(policy_path(config.start_from).with_suffix(".json"))
-        if first.training_knowledge:
-            used += first.training_knowledge.split(", ")
+    config = record.config
+    used = record.start.knowledge.split(", ") if record.start is not None and record.start.knowledge else []
     if isinstance(config.algorithm, ImitationConfig):
         teacher = create_scheduler(config.algorithm.teacher, config.env.name)
         used.append(f"imitation of {teacher.name}" + (f" ({teacher.needs})" if teacher.needs else ""))
@@ -109,6 +108,7 @@ def export_policy(
             "instances": instances,
             "episodes": episodes,
             "seed": seed,
+            domain.unit: length or domain.default_horizon,
         }
     save_network(path, network, msgspec.structs.replace(card, scores={**card.scores, **measured}))
     return load_network(path)[1]

@@ -78,7 +78,7 @@ class Imitation:
 
     def _usual(self, advantages: np.ndarray) -> float:
         """What the best choice is worth on average, of advantages (N, n_targets): the unit of a run's temperatures."""
-        usual = float(advantages.max(axis=1).mean()) if len(advantages) else 0.0
+        usual = float(advantages.max(axis=1).mean())
         if usual <= 0.0:
             raise InvalidOptionError(
                 f"algorithm.teacher: to {self._teacher.name} no choice of the first update's {len(advantages)} turns "

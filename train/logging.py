@@ -32,7 +32,7 @@ class RunLog:
 
     def __init__(self, directory: Path, *, updates: int, start: int, device: str, quiet: bool = False) -> None:
         self._path, self._start, self._device = directory / "progress.csv", start, device
-        self._writer = SummaryWriter(str(directory / "tensorboard"), purge_step=start)
+        self._writer = SummaryWriter(str(directory / "tensorboard"), purge_step=start + 1)
         self._bar = Progress(
             TextColumn("{task.description}"),
             BarColumn(),

@@ -30,6 +30,7 @@ from marl_sched.train.config import (
     IppoConfig,
     PolicyConfig,
     RunRecord,
+    Start,
     StateValueConfig,
     StepBaselineConfig,
     TrainConfig,
@@ -55,13 +56,26 @@ class Parts:
     length: EpisodeLength
     validation: Validation
 
+    def start_from(self, name_or_path: str) -> Start:
+        """Take over the weights of a trained policy, which must have the same sizes.
+
+        Raises InvalidFileError for damaged files and another metagraph, UnknownNameError or InvalidOptionError.
+        """
+        path, network = policy_path(name_or_path), self.learner.policy
+        first, card = load_network(path)
+        check_graph(path, card, network.spec)
+        if first.sizes != network.sizes:
+            raise InvalidOptionError(f"train: start_from: expected a network of {network.sizes}, got {first.sizes}")
+        network.load_state_dict(first.state_dict())
+        return Start(weights_sha256=card.weights_sha256, command=card.command, knowledge=card.training_knowledge)
+
     def validate(self, counters: Counters, directory: Path) -> dict[str, float]:
         """Play the validation instances if it is time to, and keep the policy if it is the best so far."""
         config = self.record.config
         if counters.update % config.validation.every and counters.update != config.updates:
             return {}
         score = self.validation(self.learner.policy)
-        if counters.best is None or score > counters.best:
+        if counters.best is None or self.validation.prefers(score, counters.best):
             counters.best = score
             save_best(self.learner.policy, self.record, counters.update, score, directory)
         return {"validation": score, "best": counters.best}
@@ -81,7 +95,7 @@ class Parts:
 
 
 def build(record: RunRecord) -> Parts:
-    """The parts that a run's configuration names, with freshly drawn networks or those that it starts from."""
+    """The parts that a run's configuration names, with freshly drawn networks."""
     config = record.config
     length = EpisodeLength(**msgspec.structs.asdict(config.curriculum), seed=config.seed)
     with torch.random.fork_rng(devices=[]):
@@ -148,6 +162,10 @@ def _with_teacher(config: TrainConfig, algorithm: ImitationConfig, length: Episo
             f"train: algorithm.teacher: expected a scheduler that can tell how good every choice is, "
             f"got {algorithm.teacher}"
         )
+    if "clock" in teacher.needs:  # training episodes are cut before the end that such a teacher plans for
+        raise InvalidOptionError(
+            f"train: algorithm.teacher: expected a scheduler that does not heed the time left, got {algorithm.teacher}"
+        )
     teacher.start(env.simulator, np.ones(env.simulator.batch, np.bool_))
     collector = SegmentCollector(env, turns=algorithm.turns, length=length(0), central=_hides(config))
     return collector, Imitation(_policy(config, env), teacher, algorithm)
@@ -163,19 +181,8 @@ def _critic(config: TrainConfig, env: SchedulingTorchRL, sizes: HetGATConfig) ->
 
 
 def _policy(config: TrainConfig, env: SchedulingTorchRL) -> PolicyNetwork:
-    """A freshly drawn network, or a copy of the one that the run starts from, which must have the same sizes.
-
-    Weights are drawn on the CPU, so that a seed's are the same on every device.
-    """
-    network = new_network(env.simulator.graph, _sizes(config.policy, env))
-    if config.start_from is not None:
-        start = policy_path(config.start_from)
-        first, card = load_network(start)
-        check_graph(start, card, network.spec)
-        if first.sizes != network.sizes:
-            raise InvalidOptionError(f"train: start_from: expected a network of {network.sizes}, got {first.sizes}")
-        network.load_state_dict(first.state_dict())
-    return network.to(pick_device(config.device))
+    """A freshly drawn network. Weights are drawn on the CPU, so that a seed's are the same on every device."""
+    return new_network(env.simulator.graph, _sizes(config.policy, env)).to(pick_device(config.device))
 
 
 def _sizes(policy: PolicyConfig, env: SchedulingTorchRL) -> Sizes:

@@ -67,12 +67,18 @@ def thinned(
     where a policy is nearly certain (a crew that waits, hour after hour) there is little to learn, and
     the weights keep every sum's expectation. `keep_least` 1 keeps all.
 
+    Raises InvalidOptionError if none is kept.
     Returns the samples, the target that each decision node of theirs stands for, int64 (N, n_kept), and
     the row of the flattened rollout (T B) that each comes from, int64 (N,).
     """
     certainty = torch.where(counted, rollout.log_probs, 0.0).exp()
     keep = (1 - certainty).clamp(keep_least, 1.0)
     rows = (counted & (torch.from_numpy(rng.random(counted.shape)) < keep)).flatten().nonzero().squeeze(1)
+    if not len(rows):
+        raise InvalidOptionError(
+            f"train: none of the {int(counted.sum())} turns of an update that count was kept to learn from; expected "
+            "more instances, longer segments (algorithm.turns) or a larger share of certain turns (keep_least)"
+        )
     observation, names = _as_read(policy, _picked(rollout.observation, rows))
     data = {"observation": observation, "weight": (1 / keep).flatten()[rows]}
     return TensorDict(data, batch_size=[len(rows)]), names, rows

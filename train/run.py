@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import torch
+from msgspec import structs
 
 from marl_sched.agents.cards import source_revision
 from marl_sched.errors import InvalidOptionError
@@ -35,21 +37,32 @@ def train_from_overrides(overrides: Sequence[str], *, quiet: bool = False) -> Pa
     config = load_config(overrides)
     directory = Path(config.directory())
     if (directory / CONFIG).exists():
-        raise InvalidOptionError(f"run_dir: {directory} holds a run already; resume it or choose another")
+        raise InvalidOptionError(
+            f"run_dir: {directory} holds a run already: go on with it by `marl-sched resume {directory}`, or choose "
+            "another folder with run_dir=DIR"
+        )
     record = RunRecord(config=config, overrides=list(overrides), revision=source_revision())
     parts, counters = build(record), Counters()
+    if config.start_from is not None:
+        parts = replace(parts, record=structs.replace(record, start=parts.start_from(config.start_from)))
     parts.save(counters, directory)  # first, so that whatever holds a run can be resumed
-    write_json(directory / CONFIG, msgspec.to_builtins(record))
+    write_json(directory / CONFIG, msgspec.to_builtins(parts.record))
     return train(parts, counters, directory, quiet=quiet)
 
 
 def resume(run_dir: str | Path, *, quiet: bool = False) -> Path:
     """Go on with a run from its last checkpoint as if it had not stopped: exactly so on a CPU.
 
-    On a GPU sums are made in no fixed order. A checkpoint is not bound to the device on which it was made.
+    On a GPU sums are made in no fixed order. A checkpoint is not bound to the device on which it was made. If the
+    source is another one by now, that may change what is learned: the record and the cards from here on name both.
     """
     directory = Path(run_dir)
-    parts = build(load_record(directory / CONFIG))
+    record, revision = load_record(directory / CONFIG), source_revision()
+    if revision != [record.revision, *record.resumed_on][-1]:
+        record = structs.replace(record, resumed_on=[*record.resumed_on, revision])
+        write_json(directory / CONFIG, msgspec.to_builtins(record))
+        warnings.warn(f"{directory}: goes on with another source than before: {record.source}", stacklevel=2)
+    parts = build(record)
     return train(parts, parts.restore(directory), directory, quiet=quiet)
 
 

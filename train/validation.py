@@ -15,17 +15,21 @@ class Validation:
     def __init__(self, config: TrainConfig) -> None:
         self._mode = config.validation.mode
         self._domain: Domain = get_domain(config.env.name)
-        scale = config.env.scales[0]
-        self._instances = self._domain.instances(scale, config.validation.instances, config.validation.seed)
+        first, largest = config.env.scales[0], max(config.env.scales, key=list(self._domain.scales).index)
+        self._instances = self._domain.instances(first, config.validation.instances, config.validation.seed)
         self._settings = Settings(
             episodes=config.validation.episodes,
             seed=config.validation.seed,
             view=config.make_view(),
             objective=config.env.objective,
             horizon=config.validation.length,
-            scale=scale,
+            scale=largest,  # whose padding some networks are bound to
             options=config.env.options,
         )
+
+    def prefers(self, score: float, other: float) -> bool:
+        """Whether a score is the better one."""
+        return score < other if self._domain.better == "lower" else score > other
 
     def __call__(self, network: PolicyNetwork) -> float:
         """M1, the mean over instances and episodes."""

@@ -7,7 +7,7 @@ from marl_sched.agents.airme_rules import RULES
 from marl_sched.domain import get_domain
 from marl_sched.errors import InvalidFileError
 from marl_sched.train import plots
-from marl_sched.train.compare import play_episode, read_learning_curve
+from marl_sched.train.compare import draw_learning_curves, play_episode, read_learning_curve
 from marl_sched.train.evaluate import Settings, evaluate_scheduler
 
 AIRME = get_domain("airme")
@@ -101,3 +101,15 @@ def test_a_picture_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
     with pytest.raises(ZeroDivisionError):
         plots.save(figure, tmp_path / "curve.png")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_logs_of_folders_with_the_same_name_are_drawn_side_by_side(tmp_path, monkeypatch):
+    logs = [tmp_path / place / "seed0" / "progress.csv" for place in "ab"] + [tmp_path / "c" / "progress.csv"]
+    for log in logs:
+        log.parent.mkdir(parents=True)
+        log.write_text("seconds,validation\n60,0.5\n")
+    drawn = {}
+    monkeypatch.setattr(plots, "learning_curves", lambda curves: drawn.update(curves))
+    monkeypatch.setattr(plots, "save", lambda figure, path: path)
+    draw_learning_curves(tmp_path / "out.png", logs)
+    assert list(drawn) == [str(logs[0]), str(logs[1]), "c"]

@@ -59,6 +59,19 @@ def test_unknown_names_are_refused_before_anything_runs(override: str):
         load_config([override])
 
 
+def test_a_domain_without_a_configuration_cannot_be_learned():
+    with pytest.raises(InvalidOptionError, match=r"env\.name: murse cannot be learned yet, .* known: airme"):
+        load_config(["env.name=murse", "env.objective=makespan"])
+
+
+def test_runs_that_differ_in_view_algorithm_or_network_have_folders_of_their_own():
+    groups = [[], ["view=local"], ["view=local", "view.reach=2"], ["algorithm=ippo"], ["policy=decima"], ["seed=1"]]
+    folders = [load_config(overrides).directory() for overrides in groups]
+    assert folders[0] == "runs/airme-full-profit-hetgat-gae-seed0"
+    assert folders[2] == "runs/airme-local-2-1-0-profit-hetgat-gae-seed0"
+    assert len(set(folders)) == len(folders)
+
+
 def test_a_record_survives_its_file_and_names_the_command_without_its_place(tmp_path: Path):
     overrides = ["view=local", "env.scales=[small, medium]", "run_dir=/somewhere"]
     record = RunRecord(config=load_config(overrides), overrides=overrides, revision="abc")

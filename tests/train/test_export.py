@@ -32,6 +32,7 @@ def test_the_card_holds_what_an_evaluation_with_that_seed_measures(tmp_path: Pat
     assert card.scores["small"]["M1"] == pytest.approx(scores.measures["profit"].mean())
     assert card.scores["small"]["visible_share"] == pytest.approx(scores.visible_share)
     assert card.scores["validation"]["scale"] == "small"
+    assert (card.scores["small"]["hours"], card.scores["validation"]["hours"]) == (20, 10)
     assert card.command == "marl-sched train " + " ".join(TINY)
 
 

@@ -166,3 +166,9 @@ def test_a_rule_that_scores_nothing_cannot_teach(tmp_path) -> None:
     overrides = [*TINY, "algorithm=imitation", "algorithm.teacher=corrective", f"run_dir={tmp_path / 'a'}"]
     with pytest.raises(InvalidOptionError, match=r"algorithm\.teacher"):
         train_from_overrides(overrides, quiet=True)
+
+
+def test_a_teacher_that_plans_for_the_end_cannot_teach_episodes_that_are_cut_before_it(tmp_path) -> None:
+    overrides = [*TINY, "algorithm=imitation", "algorithm.teacher=index", f"run_dir={tmp_path / 'a'}"]
+    with pytest.raises(InvalidOptionError, match=r"algorithm\.teacher: .* does not heed the time left"):
+        train_from_overrides(overrides, quiet=True)

@@ -17,7 +17,7 @@ from marl_sched.train.collect import EpisodeCollector, InstanceSource, Rollout, 
 from marl_sched.train.config import PpoConfig
 from marl_sched.train.estimators import CriticEstimator, Estimate, OwnTurns, StepBaseline
 from marl_sched.train.learner import PolicyGradient
-from marl_sched.train.ppo import Ppo, Sampler, policy_loss, samples_of
+from marl_sched.train.ppo import Ppo, Sampler, policy_loss, samples_of, thinned
 
 CONFIG = PpoConfig(
     clip=0.2, epochs=2, minibatch=64, learning_rate=1e-3, final_learning_rate=0.0, entropy=0.01, final_entropy=0.0,
@@ -194,3 +194,11 @@ def test_a_segment_in_which_no_agent_has_two_turns_is_refused() -> None:
     learner = PolicyGradient(Ppo(policy, critic, CONFIG), OwnTurns(critic, discount=0.9, trace=0.9, centred=True))
     with pytest.raises(InvalidOptionError, match=r"algorithm\.turns: .* 1 turns"):
         learner.learn(rollout, 0.0, np.random.default_rng(0))
+
+
+def test_an_update_of_which_nothing_is_kept_is_refused() -> None:
+    policy, _ = networks()
+    rollout = segment(policy)
+    certain = replace(rollout, log_probs=torch.zeros_like(rollout.log_probs))
+    with pytest.raises(InvalidOptionError, match=r"none of the .* turns of an update that count was kept"):
+        thinned(policy, certain, rollout.valid[:-1], 1e-12, np.random.default_rng(0))

@@ -1,19 +1,24 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from safetensors.torch import load_file
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from marl_sched.agents.cards import read_card, source_revision
 from marl_sched.agents.learned.policy import NetworkPolicy
 from marl_sched.errors import InvalidFileError, InvalidOptionError
-from marl_sched.files import read_json
-from marl_sched.train.config import RunRecord, load_config
+from marl_sched.files import read_json, write_json
+from marl_sched.train.checkpoint import Counters
+from marl_sched.train.config import RunRecord, load_config, load_record
 from marl_sched.train.logging import RunLog
 from marl_sched.train.parts import build
 from marl_sched.train.run import resume, train_from_overrides
+from marl_sched.train.validation import Validation
 
 TINY = [
     "view=local", "policy.width=2", "policy.heads=2", "policy.layers=2", "algorithm.ppo.minibatch=64", "updates=4",
@@ -155,3 +160,56 @@ def test_a_damaged_checkpoint_is_refused_by_name(damage: str, tmp_path: Path):
 def test_resuming_what_is_no_run_is_refused(tmp_path: Path):
     with pytest.raises(InvalidFileError, match=r"config\.json"):
         resume(tmp_path, quiet=True)
+
+
+def test_a_run_that_goes_on_with_another_source_says_so_and_its_cards_name_both(tmp_path: Path):
+    directory = train_from_overrides([*GAE, "updates=2", f"run_dir={tmp_path}"], quiet=True)
+    record = read_json(directory / "config.json")
+    record["revision"], record["config"]["updates"] = "abc", 4
+    write_json(directory / "config.json", record)
+    with pytest.warns(UserWarning, match="another source than before: abc, then "):
+        resume(directory, quiet=True)
+    assert load_record(directory / "config.json").resumed_on == [source_revision()]
+    build(load_record(directory / "config.json")).validate(Counters(update=4), directory)
+    assert read_card(directory / "policy.json").git_hash == f"abc, then {source_revision()}"
+
+
+def test_a_resumed_run_does_not_need_the_policy_that_it_started_from(tmp_path: Path):
+    first = train_from_overrides([*GAE, "updates=1", f"run_dir={tmp_path / 'first'}"], quiet=True)
+    start = first / "policy.safetensors"
+    second = train_from_overrides([*GAE, "updates=2", f"start_from={start}", f"run_dir={tmp_path / 'b'}"], quiet=True)
+    kept = load_record(second / "config.json").start
+    assert kept is not None
+    assert kept.weights_sha256 == read_card(first / "policy.json").weights_sha256
+    assert kept.command == read_card(first / "policy.json").command
+    start.unlink()
+    (second / "config.json").write_text((second / "config.json").read_text().replace('"updates": 2', '"updates": 4'))
+    resume(second, quiet=True)
+    assert rows(second)[-1]["update"] == "4"
+
+
+def test_a_resumed_run_keeps_its_points_for_tensorboard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    with monkeypatch.context() as patch:
+        stop_in_update(patch, 3)
+        with pytest.raises(StoppedError):
+            train_from_overrides([*GAE, f"run_dir={tmp_path}"], quiet=True)
+    resume(tmp_path, quiet=True)
+    events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    assert [event.step for event in events.Scalars("reward_rate")] == [1, 2, 3, 4]
+    assert [event.step for event in events.Scalars("validation")] == [2, 4]
+
+
+def test_a_network_that_is_bound_to_the_largest_scale_is_validated_on_the_smaller_one(tmp_path: Path):
+    words = [word for word in STEP_BASELINE if not word.startswith("policy.")]
+    bound = [*words, "policy=deeprm", "env.scales=[small, medium]", "updates=2", f"run_dir={tmp_path}"]
+    directory = train_from_overrides(bound, quiet=True)
+    assert [bool(row["validation"]) for row in rows(directory)] == [False, True]
+
+
+@pytest.mark.parametrize(("better", "best"), [("higher", 0.7), ("lower", 0.5)])
+def test_the_best_score_is_the_lowest_where_lower_is_better(better: str, best: float):
+    validation = Validation(load_config(GAE))
+    validation._domain = replace(validation._domain, better=better)
+    assert validation.prefers(best, 0.6)
+    assert not validation.prefers(0.6, best)
+    assert not validation.prefers(best, best)

@@ -13,7 +13,7 @@ from marl_sched.agents.hetgat.network import HetGATNetwork
 from marl_sched.domain import get_domain
 from marl_sched.envs.torchrl_env import SchedulingTorchRL
 from marl_sched.train.collect import InstanceSource, Rollout
-from marl_sched.train.config import load_config
+from marl_sched.train.config import RunRecord, load_config
 from marl_sched.train.export import knowledge
 from marl_sched.train.ppo import Sampler, samples_of
 from marl_sched.train.state_value import TIME_LEFT, StateValue, StateValueBaseline, TimedEpisodes
@@ -84,10 +84,14 @@ def test_critic_reads_the_time_left_and_the_state_node_but_sums_no_nodes(rollout
     assert not torch.allclose(critic({**seen, "state": seen["state"] + 1}), before)
 
 
+def recorded(*overrides: str) -> RunRecord:
+    return RunRecord(config=load_config(overrides), overrides=list(overrides), revision="")
+
+
 def test_card_says_that_the_critic_was_told_the_time_left():
-    assert knowledge(load_config(["algorithm=state_value", "view=local"])) == "a critic that is told the time left"
+    assert knowledge(recorded("algorithm=state_value", "view=local")) == "a critic that is told the time left"
 
 
 @pytest.mark.parametrize(("algorithm", "used"), [("gae", "a critic on the full graph"), ("ippo", "")])
 def test_card_of_a_policy_trained_on_random_views_says_whether_the_critic_saw_more(algorithm: str, used: str):
-    assert knowledge(load_config([f"algorithm={algorithm}", "view=random"])) == used
+    assert knowledge(recorded(f"algorithm={algorithm}", "view=random")) == used
