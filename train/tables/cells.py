@@ -123,7 +123,7 @@ class Job:
         if isinstance(inputs, Bound):
             return 5000.0 * inputs.price_vectors * inputs.evaluations * inputs.horizon / 720
         rows = inputs.instances * inputs.episodes * inputs.horizon / 720
-        return rows * size * (10.0 if self.weights is None else 300.0 * size)
+        return rows * size * (10.0 if self.weights is None else 60.0)
 
 
 def describe(inputs: Inputs) -> str:
