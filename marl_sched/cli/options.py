@@ -90,14 +90,10 @@ def tell_of_training(name: str, card: PolicyCard | None, view: Any, objective: s
     from marl_sched.train.evaluate import view_as_json
 
     trained, now = card.view, view_as_json(view)
-    told = (
-        []
-        if trained == now or trained["kind"] == "random"
-        else [f"view {_words(trained)}, it plays with {_words(now)}"]
-    )
-    told += [] if card.objective == objective else [f"{card.objective}, it plays for {objective}"]
-    for difference in told:
-        typer.echo(f"note: {name} was trained for {difference}", err=True)
+    if trained != now and trained["kind"] != "random":
+        typer.echo(f"note: {name} was trained for view {_words(trained)}, it plays with {_words(now)}", err=True)
+    if card.objective != objective:
+        typer.echo(f"note: {name} was trained for {card.objective}, it plays for {objective}", err=True)
 
 
 def _words(view: Mapping[str, Any]) -> str:
