@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping
 from pathlib import Path
-from typing import get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -20,6 +20,16 @@ from marl_sched.errors import InvalidOptionError
 from marl_sched.graph import ACTION_MASK, STATE, TIME, VISIBLE_SHARE, GraphSpec
 from marl_sched.simulation import TurnSimulator
 
+Observation = Mapping[str, np.ndarray]
+_NEVER = -1  # before every simulated time
+
+
+class _FirstLogits(NamedTuple):
+    """Of every row of a batch, the simulated time, int64 (B,), of the moment whose first logits are kept."""
+
+    moment: np.ndarray
+    logits: np.ndarray  # float32 (B, n_targets)
+
 
 class NetworkPolicy(ObservationScheduler):
     """Decides by a copy of a network, whatever its architecture.
@@ -32,7 +42,9 @@ class NetworkPolicy(ObservationScheduler):
         network: on any device; the copy is on the CPU.
         name: as users type it.
         mode: `greedy` takes the most probable target, ties to the lowest index; `sample` picks by inverse
-            distribution with the uniform that it is given.
+            distribution with the uniform that it is given. `one_pass` samples for all agents of a moment from what the
+            first of them saw, without the targets that are taken by then: how the dissertation plays what was trained
+            with one decision an hour (scheme Single, section 6.3.1). On a lone observation it samples.
         card: what the weights are, if they come from a file.
     """
 
@@ -44,7 +56,7 @@ class NetworkPolicy(ObservationScheduler):
                 f"mode of policy {name}: expected one of {', '.join(get_args(Mode))}, got {mode!r}"
             )
         self.name, self.mode, self.card = name, mode, card
-        self.samples = mode == "sample"
+        self.samples = mode != "greedy"
         self.graph: GraphSpec = network.spec
         self._network = copy.deepcopy(network).cpu().requires_grad_(False)
         with torch.inference_mode():
@@ -54,6 +66,7 @@ class NetworkPolicy(ObservationScheduler):
         self._n_features = {node.name: len(node.features) for node in self.graph.nodes}
         self._n_features[STATE] = len(self.graph.state_features)
         self._checked: GraphSpec | None = None
+        self._first = _FirstLogits(np.zeros(0, np.int64), np.zeros((0, 0), np.float32))
 
     @classmethod
     def load(cls, path: str | Path, *, mode: Mode | None = None, graph: GraphSpec | None = None) -> NetworkPolicy:
@@ -67,6 +80,11 @@ class NetworkPolicy(ObservationScheduler):
             check_graph(Path(path).with_suffix(".json"), card, graph)
         return cls(network, name=Path(path).stem, mode=card.mode if mode is None else mode, card=card)
 
+    def start(self, simulator: TurnSimulator, rows: np.ndarray) -> None:
+        """Forget what was seen in earlier episodes of these rows."""
+        if self._first.moment.shape == rows.shape:
+            self._first.moment[rows] = _NEVER
+
     def decide(self, simulator: TurnSimulator) -> np.ndarray:
         """Observe for every acting agent under the simulator's view, then choose.
 
@@ -77,23 +95,38 @@ class NetworkPolicy(ObservationScheduler):
                 check_graph(f"{self.name}.json", self.card, simulator.graph)
             self._checked = simulator.graph
         agents = simulator.acting
-        acting = agents >= 0
-        if acting.all():
-            return super().decide(simulator)
-        # Rows that are over would cost as much as the others: episodes of a batch end at different turns.
+        rows = np.flatnonzero(agents >= 0)
         targets = np.zeros(simulator.batch, np.int64)
-        if acting.any():
-            observation = {name: values[acting] for name, values in simulator.observe(agents).items()}
-            targets[acting] = self.choose(observation, simulator.policy_noise(agents)[acting])
+        if len(rows):
+            observation = simulator.observe(agents)
+            if len(rows) < simulator.batch:  # rows that are over would cost as much as the others
+                observation = {name: values[rows] for name, values in observation.items()}
+            one_pass = self.mode == "one_pass"
+            logits = self._of_moment(simulator, rows, observation) if one_pass else self.logits(observation)
+            targets[rows] = self._pick(logits, simulator.policy_noise(agents)[rows])
         return targets
 
-    def choose(self, observation: Mapping[str, np.ndarray], uniform: np.ndarray) -> np.ndarray:
+    def _of_moment(self, simulator: TurnSimulator, rows: np.ndarray, observation: Observation) -> np.ndarray:
+        """The logits of the first turn of each row's moment, for the targets that are still legal."""
+        legal = observation[ACTION_MASK] != 0
+        if self._first.logits.shape != (simulator.batch, legal.shape[1]):
+            never = np.full(simulator.batch, _NEVER)
+            self._first = _FirstLogits(never, np.zeros((simulator.batch, legal.shape[1]), np.float32))
+        new = self._first.moment[rows] != simulator.time[rows]
+        if new.any():
+            self._first.logits[rows[new]] = self.logits({name: values[new] for name, values in observation.items()})
+            self._first.moment[rows] = simulator.time[rows]
+        return np.where(legal, self._first.logits[rows], np.finfo(np.float32).min)
+
+    def choose(self, observation: Observation, uniform: np.ndarray) -> np.ndarray:
         """Targets int64 (B,) from batched observations and uniforms float64 (B,) in [0, 1)."""
-        logits = self.logits(observation)
-        return logits.argmax(1) if self.mode == "greedy" else inverse_distribution(logits, uniform)
+        return self._pick(self.logits(observation), uniform)
+
+    def _pick(self, logits: np.ndarray, uniform: np.ndarray) -> np.ndarray:
+        return inverse_distribution(logits, uniform) if self.samples else logits.argmax(1)
 
     @torch.inference_mode()
-    def logits(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
+    def logits(self, observation: Observation) -> np.ndarray:
         """Logits float32 (B, n_targets) of batched observations; the lowest finite number where illegal.
 
         Raises InvalidOptionError for an observation without the arrays or the features that it was trained on.

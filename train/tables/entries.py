@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 
-from marl_sched.agents.cards import read_card
+from marl_sched.agents.cards import Mode, read_card
 from marl_sched.agents.registry import SHIPPED, rules
 from marl_sched.train.evaluate import view_as_json
 from marl_sched.train.tables.cells import Bound, Job, Play, digest, weights_sha256
@@ -39,7 +39,8 @@ class Entries:
         """A row's entry; None if it has none for this objective and scale."""
         if not row.plays(objective, scale):
             return None
-        return self._entry(row, row.policy, objective, scale, row.view, row.options, row.episodes.get(scale))
+        fewer = row.episodes.get(scale)
+        return self._entry(row, row.policy, objective, scale, row.view, row.options, fewer, row.mode)
 
     def point(self, line: Line, view: str, scale: str) -> Job | Untrained | None:
         """A line's entry under a view by name; None if it has none."""
@@ -119,6 +120,7 @@ class Entries:
         view: Mapping[str, Any],
         options: Mapping[str, Any],
         fewer: int | None,
+        mode: Mode | None = None,
     ) -> Job | Untrained:
         weights = None
         name = player.rule or ""
@@ -133,7 +135,7 @@ class Entries:
             objective=objective,
             scheduler=name,
             weights_sha256=None if weights is None else self._hash(weights),
-            mode=None if weights is None else read_card(weights.with_suffix(".json")).mode,
+            mode=None if weights is None else mode or read_card(weights.with_suffix(".json")).mode,
             view=view_as_json(self.plan.domain.make_view(dict(view))),
             options=dict(options),
             instances=self.size.instances,

@@ -20,6 +20,11 @@ from marl_sched.train.tables.results import Results
 
 PICTURE = "price-of-decentralisation.png"
 _NONE = "-"
+_MODES = {
+    "greedy": "greedily",
+    "sample": "by sampling",
+    "one_pass": "by sampling for all who decide at a moment from one forward pass",
+}
 
 
 def page(results: Mapping[str, Any]) -> str:
@@ -197,7 +202,7 @@ def _learned(results: Mapping[str, Any]) -> Iterator[str]:
         entries += [(line["label"], point) for line in found["lines"] for point in line["points"].values()]
     for label, entry in entries:
         if (training := entry.get("training")) is not None:
-            mode = {"greedy": "greedily", "sample": "by sampling"}[entry["mode"]]
+            mode = _MODES[entry["mode"]]
             knowledge = f" Training used {training['knowledge']}." if training["knowledge"] else ""
             told = f"seed {training['seed']}, view {_view(training['view'])}, plays {mode}.{knowledge}"
             cards.setdefault(entry["scheduler"], f"- `{entry['scheduler']}` ({label}): `{training['command']}`, {told}")

@@ -13,6 +13,7 @@ import msgspec
 from msgspec import Meta, Struct
 from omegaconf import OmegaConf
 
+from marl_sched.agents.cards import Mode
 from marl_sched.agents.registry import rules
 from marl_sched.domain import Domain, get_domain
 from marl_sched.errors import InvalidFileError, InvalidOptionError, UnknownNameError, require
@@ -54,6 +55,7 @@ class Row(Player, frozen=True, kw_only=True):
         group: `published` for the methods of the dissertation, `ours` for the others.
         view: as in `Domain.make_view`.
         options: more options of the simulator, such as a scheme.
+        mode: how a policy decides, where it is not as its card says.
         objectives: in whose tables it stands; None: in all.
         scales: on which scales it plays; None: on all.
         episodes: scale -> episodes of each instance, where they are fewer than the tables'.
@@ -64,6 +66,7 @@ class Row(Player, frozen=True, kw_only=True):
     group: Literal["published", "ours"]
     view: dict[str, Any] = msgspec.field(default_factory=lambda: {"kind": "full"})
     options: dict[str, Any] = {}
+    mode: Mode | None = None
     objectives: list[str] | None = None
     scales: list[str] | None = None
     episodes: dict[str, Count] = {}
@@ -171,6 +174,8 @@ def _check(plan: Plan) -> None:
     objectives, scales = [*plan.objectives, plan.decentralisation.objective], [*plan.decentralisation.scales]
     for row in plan.rows:
         _check_player(row, plan.env)
+        if row.mode is not None and row.policy is None:
+            raise InvalidOptionError(f"mode of {row.label!r}: expected none, as a rule has no modes")
         domain.make_view(row.view)
         objectives += [*(row.objectives or ()), *row.published]
         scales += [*(row.scales or ()), *row.episodes]
