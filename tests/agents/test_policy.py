@@ -131,7 +131,7 @@ def test_a_missing_array_is_refused(network, observation):
 
 
 def test_an_unknown_mode_is_refused(network):
-    with pytest.raises(InvalidOptionError, match="expected one of greedy, sample, got 'warm'"):
+    with pytest.raises(InvalidOptionError, match="expected one of greedy, sample, one_pass, got 'warm'"):
         NetworkPolicy(network, mode="warm")
 
 
@@ -155,3 +155,29 @@ def test_a_policy_that_samples_wants_a_uniform_and_a_greedy_one_does_not(network
     with pytest.raises(InvalidOptionError, match=r"unsaved samples: act\(observation, uniform\)"):
         NetworkPolicy(network, mode="sample").act(row)
     assert NetworkPolicy(network).act(row) == NetworkPolicy(network).act(row, uniform=0.9)
+
+
+def test_in_one_pass_all_crews_of_an_hour_draw_from_what_the_first_of_them_saw():
+    domain = get_domain("airme")
+    simulator = domain.simulator(domain.instances("small", 5, 3), seed=3, horizon=12)
+    torch.manual_seed(0)
+    network = HetGATNetwork(simulator.graph, width=4, heads=2, layers=2)
+    torch.nn.init.normal_(network.readout.weight, std=5.0)
+    policy, plain = NetworkPolicy(network, mode="one_pass"), NetworkPolicy(network, mode="sample")
+    first, changed = {}, 0
+    for _ in range(2):  # episodes
+        policy.start(simulator, np.ones(5, np.bool_))
+        first.clear()
+        while (simulator.acting >= 0).all():
+            observation = simulator.observe(simulator.acting)
+            logits, noise = plain.logits(observation), simulator.policy_noise(simulator.acting)
+            for b, hour in enumerate(simulator.time):
+                kept = first.setdefault((b, int(hour)), logits[b].copy())
+                changed += bool(np.abs(kept - logits[b])[observation[ACTION_MASK][b] != 0].max() > 1e-3)
+            kept = np.array([first[b, int(hour)] for b, hour in enumerate(simulator.time)])
+            expected = inverse_distribution(np.where(observation[ACTION_MASK] != 0, kept, LOWEST), noise)
+            targets = policy.decide(simulator)
+            assert targets.tolist() == expected.tolist()
+            simulator.step(targets)
+        simulator.reset()
+    assert changed > 20  # logits of later turns would have been others

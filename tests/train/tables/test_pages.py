@@ -120,6 +120,16 @@ def test_rows_that_played_fewer_episodes_are_explained_where_there_are_any(
     assert ("episodes: 1 on small" in text) == bool(episodes)
 
 
+def test_a_row_may_decide_otherwise_than_its_policys_card_says(tiny, cells, trained, write, tmp_path):
+    tiny["rows"][-1]["mode"] = "one_pass"
+    plan = as_plan(tiny, "tiny.yaml")
+    entries = Entries(plan, plan.full, tmp_path)
+    assert entries.row(plan.rows[-1], "profit", "small").inputs.mode == "one_pass"
+    write(entries, cells)
+    text = page(Results(entries, cells, "").as_json())
+    assert "plays by sampling for all who decide at a moment from one forward pass" in text
+
+
 def test_a_view_that_shows_too_much_is_not_called_local(entries, cells, trained, write, plan):
     import msgspec
 
@@ -170,6 +180,7 @@ def test_a_missing_cell_is_named_with_the_command_and_nothing_is_written(entries
         ),
         ({"rows": [{"label": "a", "group": "ours"}]}, "'a': expected exactly one of rule, policy"),
         ({"rows": [{"label": "a", "group": "ours", "rule": "random"}] * 2}, "expected distinct labels"),
+        ({"rows": [{"label": "a", "group": "ours", "rule": "random", "mode": "sample"}]}, "mode of 'a': expected none"),
         (
             {"rows": [{"label": "a", "group": "ours", "rule": "random"}]},
             "expected one of the rule corrective-published",
