@@ -26,6 +26,7 @@ class TurnSimulator(ABC):
 
     Attributes (all shapes with B = `batch`):
         batch: number of rows.
+        view: what acting agents see, an instance of one of the domain's views; its `kind` is the view's name.
         max_agents, max_targets: padded sizes; targets are 0..max_targets-1.
         n_agents: int64 (B,), agents of each row's instance.
         acting: int64 (B,), the agent to act, -1 where nobody is to act because the episode is over.
@@ -40,6 +41,7 @@ class TurnSimulator(ABC):
     """
 
     batch: int
+    view: Any
     max_agents: int
     max_targets: int
     n_agents: np.ndarray

@@ -88,7 +88,8 @@ class NetworkPolicy(ObservationScheduler):
     def decide(self, simulator: TurnSimulator) -> np.ndarray:
         """Observe for every acting agent under the simulator's view, then choose.
 
-        Raises InvalidFileError if the policy was trained on another metagraph than the simulator's.
+        Raises InvalidFileError if the policy was trained on another metagraph than the simulator's, InvalidOptionError
+        for the mode one_pass under a view that hides something.
         """
         if simulator.graph is not self._checked:
             if self.card is not None:
@@ -108,6 +109,11 @@ class NetworkPolicy(ObservationScheduler):
 
     def _of_moment(self, simulator: TurnSimulator, rows: np.ndarray, observation: Observation) -> np.ndarray:
         """The logits of the first turn of each row's moment, for the targets that are still legal."""
+        if simulator.view.kind != "full":
+            raise InvalidOptionError(
+                f"mode of policy {self.name}: one_pass shares what the first agent sees, so it is for the full view; "
+                f"got view {simulator.view.kind}"
+            )
         legal = observation[ACTION_MASK] != 0
         if self._first.logits.shape != (simulator.batch, legal.shape[1]):
             never = np.full(simulator.batch, _NEVER)

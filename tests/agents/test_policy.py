@@ -181,3 +181,11 @@ def test_in_one_pass_all_crews_of_an_hour_draw_from_what_the_first_of_them_saw()
             simulator.step(targets)
         simulator.reset()
     assert changed > 20  # logits of later turns would have been others
+
+
+def test_one_pass_is_refused_where_it_would_show_agents_what_the_first_of_them_sees():
+    domain = get_domain("airme")
+    simulator = domain.simulator(domain.instances("small", 1, 3), view=domain.view("local"), seed=3, horizon=12)
+    policy = NetworkPolicy(HetGATNetwork(simulator.graph, width=4, heads=2, layers=2), mode="one_pass")
+    with pytest.raises(InvalidOptionError, match=r"one_pass .* is for the full view; got view local"):
+        policy.decide(simulator)
