@@ -65,8 +65,7 @@ def create_scheduler(name_or_path: str | Path, domain: Domain | str, **options: 
     table = rules(domain_name)
     if str(name_or_path) in table:
         return table[str(name_or_path)](**options)
-    if not _is_path(name_or_path) and str(name_or_path) not in scheduler_names(domain_name):
-        raise UnknownNameError("scheduler", str(name_or_path), scheduler_names(domain_name))
+    _require_known(name_or_path, domain_name)
     policy = load_policy(name_or_path, **options)
     if policy.card is not None and policy.card.domain != domain_name:
         card_path = Path(name_or_path).with_suffix(".json")
@@ -101,6 +100,7 @@ def card_of(name_or_path: str | Path, domain: Domain | str) -> PolicyCard | None
     domain_name = domain if isinstance(domain, str) else domain.name
     if str(name_or_path) in rules(domain_name):
         return None
+    _require_known(name_or_path, domain_name)
     return read_card(policy_path(name_or_path).with_suffix(".json"))
 
 
@@ -114,6 +114,12 @@ def policy_path(name_or_path: str | Path) -> Path:
     if str(name_or_path) in shipped_policies():
         return SHIPPED / f"{name_or_path}.safetensors"
     raise UnknownNameError("policy", str(name_or_path), shipped_policies())
+
+
+def _require_known(name_or_path: str | Path, domain: str) -> None:
+    """UnknownNameError for a name, not a path, that no scheduler of the domain has."""
+    if not _is_path(name_or_path) and str(name_or_path) not in scheduler_names(domain):
+        raise UnknownNameError("scheduler", str(name_or_path), scheduler_names(domain))
 
 
 def _is_path(name_or_path: str | Path) -> bool:
