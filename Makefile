@@ -54,11 +54,11 @@ TRAIN_airme-local-availability := algorithm=imitation updates=400 view=local env
 TRAIN_airme-any-profit := algorithm=imitation updates=500 view=random
 STALE := view=local view.staleness=12
 
-policy-%: $(INSTALLED) ## trains a shipped policy again and writes it into agents/shipped/
+policy-%: $(INSTALLED) ## trains a shipped policy again and writes it into agents/policies/shipped/
 	$(BIN)/marl-sched train $(or $(TRAIN_$*),$(error no policy is called $*)) run_dir=runs/$*
-	$(BIN)/marl-sched export runs/$* $* --out agents/shipped --episodes 1
+	$(BIN)/marl-sched export runs/$* $* --out agents/policies/shipped --episodes 1
 
-# With stale pictures imitation alone is not enough: what is worth doing depends on what the neighbours do.
+# With stale information imitation alone is not enough: what is worth doing depends on what the neighbours do.
 policy-airme-stale-profit: $(INSTALLED)
 	$(BIN)/marl-sched train $(STALE) algorithm=imitation updates=400 run_dir=runs/airme-stale-imitation
 	$(BIN)/marl-sched train $(STALE) algorithm=imitation algorithm.criterion=expected_advantage \
@@ -67,7 +67,7 @@ policy-airme-stale-profit: $(INSTALLED)
 	$(BIN)/marl-sched train $(STALE) algorithm.ppo.critic_alone=0.05 algorithm.ppo.policy_rate=0.1 \
 		algorithm.ppo.entropy=0.0 updates=350 \
 		start_from=runs/airme-stale-worth/policy.safetensors run_dir=runs/airme-stale-profit
-	$(BIN)/marl-sched export runs/airme-stale-profit airme-stale-profit --out agents/shipped --episodes 1
+	$(BIN)/marl-sched export runs/airme-stale-profit airme-stale-profit --out agents/policies/shipped --episodes 1
 
 format: $(INSTALLED) ## sort imports and lay out the code
 	$(BIN)/ruff check --select I --fix .

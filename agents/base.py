@@ -20,7 +20,7 @@ from marl_sched.simulation import TurnSimulator
 
 
 class Scheduler(ABC):
-    """Chooses targets for acting agents.
+    """Chooses actions for acting agents.
 
     Attributes:
         name: as users type it.
@@ -45,7 +45,7 @@ class Scheduler(ABC):
 
     @abstractmethod
     def decide(self, simulator: TurnSimulator) -> np.ndarray:
-        """Targets int64 (B,) for the acting agents; rows that are over get 0."""
+        """Actions int64 (B,) for the acting agents; rows that are over get 0."""
 
 
 class ObservationScheduler(Scheduler):
@@ -59,7 +59,7 @@ class ObservationScheduler(Scheduler):
 
     @abstractmethod
     def choose(self, observation: Mapping[str, np.ndarray], uniform: np.ndarray) -> np.ndarray:
-        """Targets int64 (B,) from batched observations and uniforms float64 (B,) in [0, 1)."""
+        """Actions int64 (B,) from batched observations and uniforms float64 (B,) in [0, 1)."""
 
     def decide(self, simulator: TurnSimulator) -> np.ndarray:
         """Observe for every acting agent under the simulator's view, then choose."""
@@ -69,7 +69,7 @@ class ObservationScheduler(Scheduler):
     def act(self, observation: Mapping[str, np.ndarray], uniform: float | None = None) -> int:
         """One agent's choice from its own observation without batch axis, as PettingZoo gives it.
 
-        Accepts the face's `{"observation": ..., "action_mask": ...}` or the flat dict. `uniform` in [0, 1)
+        Accepts the environment API's `{"observation": ..., "action_mask": ...}` or the flat dict. `uniform` in [0, 1)
         picks by inverse distribution, so a scheduler that samples must be given one, drawn by the caller; others
         ignore it. Raises InvalidOptionError where it is missing.
         """
@@ -87,16 +87,16 @@ class AdvantageScheduler(ObservationScheduler):
 
     @abstractmethod
     def advantages(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
-        """What each target is worth more than doing nothing, float64 (B, n_targets).
+        """What each action is worth more than doing nothing, float64 (B, n_actions).
 
-        0 for target 0, -inf for targets that are not legal or not worth considering.
+        0 for action 0, -inf for actions that are not legal or not worth considering.
         """
 
 
-def best_target(score: np.ndarray, eligible: np.ndarray) -> np.ndarray:
-    """The eligible target with the highest score, ties to the lowest index, 0 where none is eligible.
+def best_action(score: np.ndarray, eligible: np.ndarray) -> np.ndarray:
+    """The eligible action with the highest score, ties to the lowest index, 0 where none is eligible.
 
-    score float64 (B, n_targets), eligible bool (B, n_targets); returns int64 (B,).
+    score float64 (B, n_actions), eligible bool (B, n_actions); returns int64 (B,).
     """
     masked = np.where(eligible, score, -np.inf)
     best = masked.argmax(axis=1)

@@ -1,7 +1,7 @@
 """What only one domain has to measure in `marl-sched bench`.
 
 A domain's own measurements stand in `benchmarks(domain, batch) -> {figure: Benchmark}` of
-`marl_sched.agents.<domain>_bench`, which is imported when it is asked for.
+`marl_sched.agents.<domain>.bench`, which is imported when it is asked for.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Benchmark:
 
 def own_benchmarks(domain: Domain, batch: int) -> Mapping[str, Benchmark]:
     """A domain's own measurements by the figure's name, of `batch` instances where it is of many; empty for none."""
-    module = f"marl_sched.agents.{domain.name}_bench"
-    if find_spec(module) is None:
+    module = f"marl_sched.agents.{domain.name}.bench"
+    if find_spec(f"marl_sched.agents.{domain.name}") is None or find_spec(module) is None:
         return {}
     return import_module(module).benchmarks(domain, batch)

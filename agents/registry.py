@@ -1,6 +1,6 @@
 """Schedulers by name: a domain's rules, the policies that ship with the package, and checkpoints by path.
 
-A domain's rules stand in one table, `RULES` (name -> factory), in `marl_sched.agents.<domain>_rules`, which is
+A domain's rules stand in one table, `RULES` (name -> factory), in `marl_sched.agents.<domain>.schedulers`, which is
 imported when it is asked for; where instances may be infeasible, `IS_FEASIBLE` there tells. PyTorch is imported only
 when a policy is loaded.
 """
@@ -15,30 +15,30 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from marl_sched.agents.base import Scheduler
-from marl_sched.agents.cards import Mode, PolicyCard, read_card
+from marl_sched.agents.policies.cards import Mode, PolicyCard, read_card
 from marl_sched.domain import Domain
 from marl_sched.errors import InvalidFileError, MarlSchedError, UnknownNameError
 
 if TYPE_CHECKING:
-    from marl_sched.agents.learned.policy import NetworkPolicy
+    from marl_sched.agents.policies.network_policy import NetworkPolicy
     from marl_sched.graph import GraphSpec
 
-SHIPPED = Path(__file__).resolve().parent / "shipped"
+SHIPPED = Path(__file__).resolve().parent / "policies" / "shipped"
 _SUFFIXES = (".safetensors", ".json")
 
 
 def rules(domain: str) -> Mapping[str, Callable[..., Scheduler]]:
     """The rules of a domain, name -> factory; empty for a domain without any."""
-    module = f"marl_sched.agents.{domain}_rules"
-    if find_spec(module) is None:
+    module = f"marl_sched.agents.{domain}.schedulers"
+    if find_spec(f"marl_sched.agents.{domain}") is None or find_spec(module) is None:
         return {}
     return import_module(module).RULES
 
 
 def feasibility(domain: str) -> Callable[[Any], bool] | None:
     """What tells whether an instance is feasible: `IS_FEASIBLE` beside the domain's rules; None: nothing."""
-    module = f"marl_sched.agents.{domain}_rules"
-    if find_spec(module) is None:
+    module = f"marl_sched.agents.{domain}.schedulers"
+    if find_spec(f"marl_sched.agents.{domain}") is None or find_spec(module) is None:
         return None
     return getattr(import_module(module), "IS_FEASIBLE", None)
 
@@ -82,7 +82,7 @@ def load_policy(name_or_path: str | Path, *, mode: Mode | None = None, graph: Gr
     """
     path = policy_path(name_or_path)
     try:
-        from marl_sched.agents.learned.policy import NetworkPolicy
+        from marl_sched.agents.policies.network_policy import NetworkPolicy
     except ModuleNotFoundError as error:
         if error.name not in ("torch", "safetensors"):
             raise

@@ -1,4 +1,4 @@
-"""An agent process: it hears what its view lets it hear, keeps its belief, and decides when it is its turn.
+"""An agent process: it hears what its view lets it hear, keeps its local_state, and decides when it is its turn.
 
 By hand: `python -m marl_sched.comms.agent '{"agent": 3, "policy": "condition"}'`, or `marl-sched agent`.
 """
@@ -19,7 +19,7 @@ from marl_sched.comms import messages as wire
 from marl_sched.comms.options import AgentOptions
 from marl_sched.comms.process import run_process
 from marl_sched.comms.session import Event, Transport, spoke
-from marl_sched.domain import Belief, Domain, get_domain
+from marl_sched.domain import Domain, LocalState, get_domain
 from marl_sched.errors import DeploymentError, InvalidMessageError, InvalidOptionError
 
 log = logging.getLogger(__name__)
@@ -42,7 +42,7 @@ class Agent:
         self.counts: Counter[str] = Counter()
         self.subscriptions: set[str] = set()
         self._versions: dict[str, int] = {}
-        self._turn: wire.Turn | None = None  # the one to answer, once the belief is up to date
+        self._turn: wire.Turn | None = None  # the one to answer, once the local state is up to date
         self._sent: wire.Decision | None = None
         self._incarnation = ""
         self._lost_at: float | None = None
@@ -69,9 +69,9 @@ class Agent:
             )
         if self.domain.telemetry is None:
             raise DeploymentError(f"{frame.env} has no telemetry here: another version of this package?")
-        self.belief: Belief = self.domain.telemetry.belief(frame.problem, self.agent)
+        self.local_state: LocalState = self.domain.telemetry.local_state(frame.problem, self.agent)
         self._versions, self._turn, self._sent = {}, None, None
-        for key in (wire.CLOCK, self._keys.turn(self.agent), *self.belief.channels):
+        for key in (wire.CLOCK, self._keys.turn(self.agent), *self.local_state.channels):
             if key not in self.subscriptions:
                 self.transport.subscribe(key)
                 self.subscriptions.add(key)
@@ -98,7 +98,7 @@ class Agent:
         """
         if self._catch_up():
             return True
-        self.scheduler.choose(self.belief.observe(), np.array([0.5]))
+        self.scheduler.choose(self.local_state.observe(), np.array([0.5]))
         self._incarnation = f"{time.time_ns():x}-{os.getpid():x}"
         self.transport.announce(self._keys.alive(self.agent, self._incarnation))
         self._lost_at = None
@@ -184,7 +184,7 @@ class Agent:
     def _learn(self, channel: str, news: wire.News) -> None:
         """Believe the news of a channel unless newer ones are known."""
         if news.sequence > self._versions.get(channel, 0):
-            self.belief.hear(channel, news.payload)
+            self.local_state.hear(channel, news.payload)
             self._versions[channel] = news.sequence
 
     def _catch_up(self) -> bool:
@@ -203,7 +203,7 @@ class Agent:
         return any(self._versions.get(channel, 0) < sequence for channel, sequence in turn.needs.items())
 
     def _decide(self) -> None:
-        """Answer the turn if there is one and the belief is exactly as up to date as it asks for."""
+        """Answer the turn if there is one and the local state is exactly as up to date as it asks for."""
         turn = self._turn
         if turn is None or self._lacks(turn):
             return
@@ -211,7 +211,7 @@ class Agent:
         if any(self._versions[channel] > sequence for channel, sequence in turn.needs.items()):
             return  # the world has gone on without this decision
         if self._sent is None or self._sent.sequence != turn.sequence:
-            target = int(self.scheduler.choose(self.belief.observe(), np.array([turn.noise]))[0])
+            target = int(self.scheduler.choose(self.local_state.observe(), np.array([turn.noise]))[0])
             self._sent = wire.Decision(
                 tick=turn.tick, agent=self.agent, incarnation=turn.incarnation, sequence=turn.sequence, target=target
             )

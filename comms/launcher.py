@@ -203,11 +203,11 @@ def _check_policy(policy: str, domain: Domain) -> None:
 def warm_up(options: DeployOptions) -> None:
     """Compile, once and to Numba's cache on disk, what all the processes are about to use."""
     telemetry, simulator = options.world.telemetry(), options.world.simulator()
-    belief = telemetry.belief(telemetry.frame(simulator), 0)
+    local_state = telemetry.local_state(telemetry.frame(simulator), 0)
     for channel, payload in telemetry.messages(simulator).items():
-        if channel in belief.channels:
-            belief.hear(channel, payload)
-    belief.observe()
+        if channel in local_state.channels:
+            local_state.hear(channel, payload)
+    local_state.observe()
     simulator.observe(simulator.acting)
     simulator.policy_noise(simulator.acting)
     simulator.step(np.zeros(1, np.int64))

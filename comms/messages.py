@@ -36,7 +36,7 @@ class Message(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 
 class Frame(Message, tag="frame.1", frozen=True):
-    """What an agent needs to build its empty belief."""
+    """What an agent needs to build its empty local state."""
 
     env: str
     agents: Natural

@@ -44,7 +44,7 @@ class World:
         self.phase: wire.Phase = "gathering"
         self._keys = wire.AgentKeys(self.domain.agent_prefix)
         self._frame = self.telemetry.frame(self.simulator)
-        self._channels = [self.telemetry.belief(self._frame, a).channels for a in range(len(self.roster.seats))]
+        self._channels = [self.telemetry.local_state(self._frame, a).channels for a in range(len(self.roster.seats))]
         self._news: dict[str, wire.News] = {}
         self._progress = progress or (lambda phase, moment, horizon: None)
         self._observation = self.simulator.new_observation()
@@ -115,7 +115,7 @@ class World:
         tick, waited = self.tick, time.monotonic() - asked
         if outcome == DECIDED:
             self.books.latencies.append(waited)
-        if target >= self.simulator.max_targets or not observation[ACTION_MASK][0, target]:
+        if target >= self.simulator.max_actions or not observation[ACTION_MASK][0, target]:
             outcome = ILLEGAL
             self.books.counts["illegal"] += 1
         self.simulator.step(np.array([IDLE if outcome == ILLEGAL else target]))
@@ -126,7 +126,7 @@ class World:
         self.books.rewards.append(float(self.simulator.reward[0]))
         self.books.decisions.append(
             {
-                self.telemetry.moment: tick,
+                self.telemetry.time_unit: tick,
                 "agent": self.domain.agent_name(agent),
                 self.simulator.graph.decision_of: target,
                 "outcome": outcome,
@@ -266,8 +266,8 @@ class World:
         del self.books.events[events:]  # leaving now is no mishap
 
     def _event(self, agent: int, event: str, waited: float = 0.0) -> None:
-        self.books.note_event(self.telemetry.moment, self.tick, self.domain.agent_name(agent), event, waited)
-        log.info("%s %d: %s %s", self.telemetry.moment, self.tick, self.domain.agent_name(agent), event)
+        self.books.note_event(self.telemetry.time_unit, self.tick, self.domain.agent_name(agent), event, waited)
+        log.info("%s %d: %s %s", self.telemetry.time_unit, self.tick, self.domain.agent_name(agent), event)
 
     def _put(self, key: str, message: wire.Message) -> None:
         payload = wire.encode(message)

@@ -33,7 +33,7 @@ Slot 0 is the null plane. Hidden and padded nodes are zero and leave the masks.
 
 | array | shape | dtype | meaning |
 |---|---|---|---|
-| `plane` | (P + 1, 18) | float32 | counters, income, mission, repair, age of the picture, type |
+| `plane` | (P + 1, 18) | float32 | counters, income, mission, repair, age of the snapshot, type |
 | `plane_mask` | (P + 1,) | int8 | the plane exists and is visible |
 | `crew` | (C, 6) | float32 | free, busy, has chosen, is acting, its job |
 | `crew_mask` | (C,) | int8 | the crew exists and is visible |
@@ -85,11 +85,11 @@ for agent in env.agent_iter():
     env.step(None if over else env.action_space(agent).sample(observation["action_mask"]))
 ```
 
-### Other faces
+### Other environment APIs
 `gymnasium.make("marl_sched/AirME-v0", scheme="full")` is the dissertation's centralised interface: a step is an hour,
 an action a plane for each crew, the view full. Under the scheme `"skip"` the first 0 ends the hour's decisions, under
-`"single"` the first decision does. `marl_sched.envs.torchrl_env.SchedulingTorchRL("airme", batch_size=1024)` takes one
-turn in each of many instances per step, for training; it knows the schemes too.
+`"single"` the first decision does. `marl_sched.envs.api.torchrl_env.SchedulingTorchRL("airme", batch_size=1024)` takes
+one turn in each of many instances per step, for training; it knows the schemes too.
 
 ### Version history
 * v0: the simulator of the dissertation, chapter 6, with turns instead of a central list of decisions.
@@ -106,10 +106,10 @@ from typing import Any
 
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
-from marl_sched.envs.aec import SchedulingAEC
 from marl_sched.envs.airme.instance import AirmeInstance
-from marl_sched.envs.options import all_options
-from marl_sched.envs.parallel import SchedulingParallel
+from marl_sched.envs.api.aec import SchedulingAEC
+from marl_sched.envs.api.options import all_options
+from marl_sched.envs.api.parallel import SchedulingParallel
 
 __all__ = ["env", "parallel_env", "raw_env"]
 

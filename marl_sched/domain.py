@@ -1,4 +1,4 @@
-"""The registry of domains: what a folder of `envs/` declares so that every face, policy and command works with it.
+"""The registry of domains: what a folder of `envs/` declares for every environment API, policy and command.
 
 A third domain costs one folder that builds a `Domain` and calls `register`, and one line in
 `marl_sched.envs` that imports it.
@@ -35,8 +35,8 @@ class Instance(Protocol):
         """Write as JSON, whole or not at all."""
 
 
-class CentralFace(Protocol):
-    """How the centralised Gymnasium face speaks: one action decides for the whole team."""
+class CentralInterface(Protocol):
+    """How the centralised Gymnasium environment speaks: one action decides for the whole team."""
 
     def action_space(self, simulator: Any) -> Space[Any]:
         """The space of a joint action."""
@@ -45,7 +45,7 @@ class CentralFace(Protocol):
         """Take all turns that a joint action covers in row 0; the reward it brought and the step's infos."""
 
 
-class Belief(Protocol):
+class LocalState(Protocol):
     """What one deployed agent knows: filled from the messages it may hear, read as an observation.
 
     Attributes:
@@ -69,22 +69,22 @@ class Telemetry(Protocol):
     the world's side speak of row 0 of the domain's own simulator.
 
     Attributes:
-        moment: what a unit of simulated time is called in reports, such as "hour".
+        time_unit: what a unit of simulated time is called in reports, such as "hour".
     """
 
-    moment: str
+    time_unit: str
 
     def frame(self, simulator: Any) -> bytes:
         """What every agent is told at the start: sizes, padding and view, nothing that a view hides."""
 
     def messages(self, simulator: Any) -> dict[str, bytes]:
-        """Everything the world says at this moment: channel -> payload."""
+        """Everything the world says at this decision epoch: channel -> payload."""
 
     def series(self, simulator: Any) -> dict[str, list[float]]:
-        """The objectives of every moment so far, name -> one value per moment."""
+        """The objectives of every unit of time so far, name -> one value for each."""
 
-    def belief(self, frame: bytes, agent: int) -> Belief:
-        """An agent's empty belief; InvalidMessageError for a frame that does not parse or lacks the agent."""
+    def local_state(self, frame: bytes, agent: int) -> LocalState:
+        """An agent's empty local state; InvalidMessageError for a frame that does not parse or lacks the agent."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,7 +104,7 @@ class Domain:
         simulator: (instances, **options) -> TurnSimulator. Every domain understands the options `view`,
             `objective`, `horizon`, `seed` and `pad` (a scale's name whose largest instance sets the padding,
             or None: the largest of the given instances); unknown options raise TypeError.
-        central: the centralised face.
+        central: the centralised environment API.
         render: mode -> function of a simulator row, `ansi` gives str, `rgb_array` gives uint8 (H, W, 3).
         render_options: render mode -> options that a simulator must be made with to be drawn so.
         default_horizon: simulated time of an episode.
@@ -131,7 +131,7 @@ class Domain:
     load: Callable[[Path], Any]
     instance_type: type
     simulator: Callable[..., TurnSimulator]
-    central: CentralFace
+    central: CentralInterface
     render: Mapping[str, Callable[[Any, int], Any]]
     default_horizon: int
     telemetry: Telemetry | None = None

@@ -14,5 +14,5 @@ def register() -> None:
     """Make `gymnasium.make("marl_sched/AirME-v0")` and its siblings work."""
     for name, domain in DOMAINS.items():
         gymnasium.register(
-            id=name, entry_point="marl_sched.envs.gymnasium_env:SchedulingEnv", kwargs={"domain": domain}
+            id=name, entry_point="marl_sched.envs.api.gymnasium_env:SchedulingEnv", kwargs={"domain": domain}
         )

@@ -119,10 +119,10 @@ from typing import Any
 
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
-from marl_sched.envs.aec import SchedulingAEC
+from marl_sched.envs.api.aec import SchedulingAEC
+from marl_sched.envs.api.options import all_options
+from marl_sched.envs.api.parallel import SchedulingParallel
 from marl_sched.envs.murse.instance import MurseInstance
-from marl_sched.envs.options import all_options
-from marl_sched.envs.parallel import SchedulingParallel
 
 __all__ = ["env", "parallel_env", "raw_env"]
 

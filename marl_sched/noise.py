@@ -8,8 +8,8 @@ nanosecond where Philox costs fourteen.
 
 The name is absorbed in two steps, because a simulator reuses the first for thousands of draws:
 
-    moment = moment_key(episode_key(seed, instance, episode), time)
-    u = uniform(moment, stream, entity, draw)
+    time_word = time_key(episode_key(seed, instance, episode), time)
+    u = uniform(time_word, stream, entity, draw)
 
 All functions are compiled and may be called from Python or from other kernels. Called from Python, a key
 comes back as a plain int: pass it on as `np.uint64(key)`, since Numba takes plain ints for signed. Streams below
@@ -40,7 +40,7 @@ class Stream(IntEnum):
     """Streams that every domain shares."""
 
     POLICY = 0  # a policy's own sampling, entity = agent
-    CONFLICT = 1  # who of several agents has a target in the Parallel face, entity = target, draw = agent
+    CONFLICT = 1  # who of several agents has an action in the Parallel environment API, entity = action, draw = agent
 
 
 def as_seed(seed: Any) -> int:
@@ -65,22 +65,22 @@ def episode_key(seed: int | np.uint64, instance: int | np.uint64, episode: int |
 
 
 @njit(cache=True, inline="always")
-def moment_key(episode: np.uint64, time: int) -> np.uint64:
-    """The key of one moment of simulated time within an episode."""
+def time_key(episode: np.uint64, time: int) -> np.uint64:
+    """The key of one decision epoch of simulated time within an episode."""
     return mix((np.uint64(episode) ^ np.uint64(time)) + _GAMMA)
 
 
 @njit(cache=True, inline="always")
-def word(moment: np.uint64, stream: int, entity: int, draw: int) -> np.uint64:
+def word(time_word: np.uint64, stream: int, entity: int, draw: int) -> np.uint64:
     """Sixty-four random bits for one draw; `stream` < 256, `draw` < 65536, `entity` < 2**40."""
     name = (np.uint64(stream) << _S56) | (np.uint64(draw) << _S40) | np.uint64(entity)
-    return mix(np.uint64(moment) + (name + np.uint64(1)) * _GAMMA)
+    return mix(np.uint64(time_word) + (name + np.uint64(1)) * _GAMMA)
 
 
 @njit(cache=True, inline="always")
-def uniform(moment: np.uint64, stream: int, entity: int, draw: int) -> float:
+def uniform(time_word: np.uint64, stream: int, entity: int, draw: int) -> float:
     """A uniform in [0, 1) with 53 random bits."""
-    return np.float64(word(moment, stream, entity, draw) >> _S11) * _TO_UNIT
+    return np.float64(word(time_word, stream, entity, draw) >> _S11) * _TO_UNIT
 
 
 @njit(cache=True, inline="always")
@@ -94,5 +94,5 @@ def uniforms(keys: np.ndarray, times: np.ndarray, stream: int, entities: np.ndar
     """One uniform per row, float64 (B,), from episode keys (B,), times (B,) and entities (B,)."""
     out = np.empty(keys.shape[0])
     for b in range(keys.shape[0]):
-        out[b] = uniform(moment_key(keys[b], times[b]), stream, entities[b], draw)
+        out[b] = uniform(time_key(keys[b], times[b]), stream, entities[b], draw)
     return out

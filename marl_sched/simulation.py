@@ -1,7 +1,7 @@
 """What every domain's simulator offers: a batch of instances, each a process in which agents take turns.
 
-At each moment every unfinished row has one acting agent. Target 0 always means "do nothing" and is always
-legal. Agents that are free at the same simulated moment act in turn, each seeing what its view lets it see
+At each decision epoch every unfinished row has one acting agent. Action 0 always means "do nothing" and is always
+legal. Agents that are free at the same simulated decision epoch act in turn, each seeing what its view lets it see
 of the earlier choices; when none is left, simulated time passes until an agent is free again.
 Rows never influence each other. All arrays lead with the batch axis B.
 """
@@ -27,11 +27,11 @@ class TurnSimulator(ABC):
     Attributes (all shapes with B = `batch`):
         batch: number of rows.
         view: what acting agents see, an instance of one of the domain's views; its `kind` is the view's name.
-        max_agents, max_targets: padded sizes; targets are 0..max_targets-1.
+        max_agents, max_actions: padded sizes; actions are 0..max_actions-1.
         n_agents: int64 (B,), agents of each row's instance.
         acting: int64 (B,), the agent to act, -1 where nobody is to act because the episode is over.
         time: int64 (B,), simulated time (AirME: hours, MuRSE: time units).
-        reward: float64 (B,), team reward of the time the last step let pass; 0 while others act at the moment.
+        reward: float64 (B,), team reward of the time the last step let pass; 0 while others act at the decision epoch.
         elapsed: int64 (B,), simulated time that the last step let pass.
         conflict: bool (B,), the last choice was legal in the agent's view and impossible in truth.
         terminated, truncated: bool (B,), how the episode ended, false while it runs.
@@ -43,7 +43,7 @@ class TurnSimulator(ABC):
     batch: int
     view: Any
     max_agents: int
-    max_targets: int
+    max_actions: int
     n_agents: np.ndarray
     acting: np.ndarray
     time: np.ndarray
@@ -73,20 +73,20 @@ class TurnSimulator(ABC):
         """
 
     @abstractmethod
-    def step(self, targets: np.ndarray) -> None:
+    def step(self, actions: np.ndarray) -> None:
         """Apply the acting agents' choices, int64 (B,), and go on to each row's next acting agent.
 
-        Rows that are over ignore their target. A target that is impossible in truth idles the agent and
-        sets `conflict`; whether it is legal in the agent's view is for the faces to check.
-        Raises IllegalActionError for a target outside [0, max_targets).
+        Rows that are over ignore their action. An action that is impossible in truth idles the agent and
+        sets `conflict`; whether it is legal in the agent's view is for the environment APIs to check.
+        Raises IllegalActionError for an action outside [0, max_actions).
         """
 
     @abstractmethod
     def observe(self, agents: np.ndarray, out: Observation | None = None) -> Observation:
         """The graph that each row's agent, int64 (B,), sees now, written to `out` or to fresh arrays.
 
-        A negative agent gives an empty graph in which only target 0 is legal. An agent that is busy or has
-        acted at this moment may do nothing but target 0.
+        A negative agent gives an empty graph in which only action 0 is legal. An agent that is busy or has
+        acted at this decision epoch may do nothing but action 0.
         """
 
     @abstractmethod
@@ -95,10 +95,10 @@ class TurnSimulator(ABC):
 
     @abstractmethod
     def free_agents(self, row: int) -> np.ndarray:
-        """The agents, int64, that have still to act at this moment in `row`, in turn order."""
+        """The agents, int64, that have still to act at this decision epoch in `row`, in turn order."""
 
     def give_turn(self, row: int, agent: int) -> None:
-        """Let an agent that has still to act at this moment act next; the others follow in turn order.
+        """Let an agent that has still to act at this decision epoch act next; the others follow in turn order.
 
         Raises IllegalActionError for an agent that has no turn left.
         """
@@ -126,11 +126,11 @@ class TurnSimulator(ABC):
         return {name: spec.empty(self.batch) for name, spec in self.arrays.items()}
 
     def legal(self) -> np.ndarray:
-        """The acting agents' action masks, int8 (B, max_targets)."""
+        """The acting agents' action masks, int8 (B, max_actions)."""
         return self.observe(self.acting)[ACTION_MASK]
 
     def policy_noise(self, agents: np.ndarray, draw: int = 0) -> np.ndarray:
-        """The uniform, float64 (B,), with which a sampling policy picks for these agents at this moment."""
+        """The uniform, float64 (B,), with which a sampling policy picks for these agents at this decision epoch."""
         return uniforms(self.episode_keys, self.time, Stream.POLICY, np.maximum(agents, 0), draw)
 
     @property

@@ -1,7 +1,7 @@
 """How good choices were: estimators to choose from, along the team's sequence of turns or along an agent's own.
 
 Time passes only when all agents that are free have acted, so discounting is semi-Markov: a turn that lets
-e units of simulated time pass discounts what follows by gamma ** e, and by 1 within a moment.
+e units of simulated time pass discounts what follows by gamma ** e, and by 1 within a decision epoch.
 Turns that are not valid (after an episode's end, or at its cut) may hold anything, NaN included, and get 0.
 """
 
@@ -33,7 +33,7 @@ def generalised_advantages(
             as at the cut of an episode that could have gone on.
         discount: gamma, per unit of simulated time.
         trace: lambda, per unit of simulated time: how far credit reaches does not depend on how many agents
-            act at a moment.
+            act at a decision epoch.
     """
     taken = valid[:-1]
     passed = torch.where(taken, elapsed.double(), 0.0)
@@ -64,7 +64,7 @@ def own_turn_advantages(
     """Generalised advantage estimates along each agent's own turns, as independent learners have them (IPPO).
 
     To an agent a turn lasts until its next own one. It earns all that the team does in between, discounted to the
-    turn's moment, and what follows is discounted by gamma to the power of the time between.
+    turn's decision epoch, and what follows is discounted by gamma to the power of the time between.
 
     At a cut and at the segment's end only one agent is about to act; the value of the others' future is not known.
     An agent's last turn before it therefore is not learned from, it only serves the turn before as its future; where
@@ -120,9 +120,9 @@ def returns_by_time(
     rate = torch.where(valid & (elapsed > 0), rewards.double() / elapsed.clamp(min=1), 0.0)
     span = torch.where(valid, elapsed, 0)
     for offset in range(int(span.max())):
-        moment = times + offset
-        inside = (offset < span) & (moment < length)
-        earned.scatter_add_(0, torch.where(inside, moment, 0), torch.where(inside, rate, 0.0))
+        at_time = times + offset
+        inside = (offset < span) & (at_time < length)
+        earned.scatter_add_(0, torch.where(inside, at_time, 0), torch.where(inside, rate, 0.0))
     to_go = torch.zeros(batch, dtype=torch.float64)
     returns = torch.empty_like(earned)
     for t in reversed(range(length)):

@@ -1,4 +1,4 @@
-"""How fast a domain's simulator, its faces and the policy are on this machine, on one thread.
+"""How fast a domain's simulator, its environment APIs and the policy are on this machine, on one thread.
 
 A figure is the best of several repeats in CPU time of the one thread, so that what else runs on the machine counts
 as little as it can. Nothing is compiled, drawn or decided within a measurement that is not what it is of.
@@ -14,11 +14,11 @@ import numpy as np
 import torch
 
 from marl_sched.agents.benchmark import own_benchmarks
-from marl_sched.agents.hetgat.network import HetGATNetwork
-from marl_sched.agents.learned.policy import NetworkPolicy
+from marl_sched.agents.networks.hetgat.network import HetGATNetwork
+from marl_sched.agents.policies.network_policy import NetworkPolicy
 from marl_sched.domain import Domain
-from marl_sched.envs.aec import SchedulingAEC
-from marl_sched.envs.torchrl_env import SchedulingTorchRL
+from marl_sched.envs.api.aec import SchedulingAEC
+from marl_sched.envs.api.torchrl_env import SchedulingTorchRL
 from marl_sched.errors import InvalidOptionError
 from marl_sched.graph import ACTION_MASK
 from marl_sched.simulation import TurnSimulator

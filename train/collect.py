@@ -22,14 +22,14 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from marl_sched.domain import Domain
-from marl_sched.envs.torchrl_env import SchedulingTorchRL
+from marl_sched.envs.api.torchrl_env import SchedulingTorchRL
 
 # Last word of the seeds of training instances, to tell them from those of Domain.instances: [seed, i] and
 # [seed, i, 0] are the same seed to numpy.
 _TRAINING = 1
 
 Act = Callable[[dict[str, Tensor], np.ndarray], tuple[Tensor, Tensor]]
-"""(observations, uniforms float64 (B,)) -> targets int64 (B,) and their log-probabilities float32 (B,)."""
+"""(observations, uniforms float64 (B,)) -> actions int64 (B,) and their log-probabilities float32 (B,)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,8 +39,8 @@ class Rollout:
     Attributes:
         observation: what acting agents saw, name -> (T + 1, B, ...).
         central: the same under the full view; the same object where the view is full.
-        targets: int64 (T, B).
-        log_probs: float32 (T, B), of the targets under the policy that chose them.
+        actions: int64 (T, B).
+        log_probs: float32 (T, B), of the actions under the policy that chose them.
         rewards, elapsed: float64 and int64 (T, B).
         times: int64 (T + 1, B), simulated time at each turn.
         agents: int64 (T + 1, B), whose turn it is, -1 where nobody's.
@@ -51,7 +51,7 @@ class Rollout:
 
     observation: dict[str, Tensor]
     central: dict[str, Tensor]
-    targets: Tensor
+    actions: Tensor
     log_probs: Tensor
     rewards: Tensor
     elapsed: Tensor
@@ -129,13 +129,13 @@ class _Recorder:
         self._keep(times=torch.from_numpy(simulator.time.copy()), agents=torch.from_numpy(simulator.acting.copy()))
 
     def step(self, state: TensorDictBase, act: Act) -> tuple[TensorDictBase, Tensor]:
-        """Take a turn; the next state and the targets chosen."""
+        """Take a turn; the next state and the actions chosen."""
         simulator = self._env.simulator
-        targets, log_probs = act(self._views[0][-1], simulator.policy_noise(simulator.acting))
-        after = self._env.step(state.set("action", targets))["next"]
-        self._keep(targets=targets, log_probs=log_probs)
+        actions, log_probs = act(self._views[0][-1], simulator.policy_noise(simulator.acting))
+        after = self._env.step(state.set("action", actions))["next"]
+        self._keep(actions=actions, log_probs=log_probs)
         self._keep(rewards=after["reward"].squeeze(-1), elapsed=after["elapsed"])
-        return after, targets
+        return after, actions
 
     def _keep(self, **columns: Tensor) -> None:
         for name, column in columns.items():
@@ -207,7 +207,7 @@ class SegmentCollector:
         self._cut = np.maximum(length * np.arange(1, rows + 1) // rows, 1)
         self._resets = np.ones(rows, np.int64)
         self._taken = np.zeros(rows, np.int64)  # turns since a row's episode began
-        self._chosen = np.zeros((rows, turns), np.int64)  # the targets chosen in them
+        self._chosen = np.zeros((rows, turns), np.int64)  # the actions chosen in them
         self._state = env.reset()
 
     def collect(self, act: Act, length: int) -> Rollout:
@@ -219,15 +219,15 @@ class SegmentCollector:
             valid = alive & (simulator.time < self._cut)
             recorder.observe(self._state, valid, alive)
             if turn < self._turns:
-                self._state, targets = recorder.step(self._state, act)
-                self._remember(targets.numpy())
+                self._state, actions = recorder.step(self._state, act)
+                self._remember(actions.numpy())
                 self._begin(~valid, length)
         return recorder.rollout(length)
 
-    def _remember(self, targets: np.ndarray) -> None:
+    def _remember(self, actions: np.ndarray) -> None:
         if self._taken.max() == self._chosen.shape[1]:
             self._chosen = np.concatenate([self._chosen, np.zeros_like(self._chosen)], axis=1)
-        self._chosen[np.arange(len(targets)), self._taken] = targets
+        self._chosen[np.arange(len(actions)), self._taken] = actions
         self._taken += 1
 
     def _begin(self, rows: np.ndarray, length: int) -> None:
@@ -265,5 +265,5 @@ class SegmentCollector:
                 self._reset(starting)
             if left > 0:
                 replayed = self._taken - left  # negative before a row has started, whose turns do not matter
-                targets = np.where(replayed >= 0, self._chosen[rows, np.maximum(replayed, 0)], 0)
-                self._state = self.env.step(self._state.set("action", torch.from_numpy(targets)))["next"]
+                actions = np.where(replayed >= 0, self._chosen[rows, np.maximum(replayed, 0)], 0)
+                self._state = self.env.step(self._state.set("action", torch.from_numpy(actions)))["next"]

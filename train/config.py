@@ -22,7 +22,7 @@ from msgspec import Meta, Struct
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from marl_sched.agents.cards import Heads, Layers, Mode, Width
+from marl_sched.agents.policies.cards import Heads, Layers, Mode, Width
 from marl_sched.domain import get_domain
 from marl_sched.errors import InvalidFileError, InvalidOptionError
 from marl_sched.files import read_json

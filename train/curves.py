@@ -1,6 +1,6 @@
 """Learning curves of many runs in one picture: a line for every seed and the mean of those that belong together.
 
-The numbers come first, as JSON; the picture is drawn from them (marl_sched.train.plots.curves_by_group).
+The numbers come first, as JSON; the picture is drawn from them (marl_sched.train.evaluation.plots.curves_by_group).
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import msgspec
 import numpy as np
 
 from marl_sched.errors import InvalidOptionError, require
-from marl_sched.train.compare import read_curve
 from marl_sched.train.config import RunRecord, load_record
+from marl_sched.train.evaluation.compare import read_curve
 from marl_sched.train.export import CONFIG
 
 SCHEMA = 1

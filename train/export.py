@@ -7,14 +7,14 @@ from pathlib import Path
 
 import msgspec
 
-from marl_sched.agents.cards import PolicyCard
-from marl_sched.agents.learned.checkpoint import load_network, save_network
-from marl_sched.agents.learned.network import PolicyNetwork, slots_of
-from marl_sched.agents.learned.policy import NetworkPolicy
+from marl_sched.agents.networks.network import PolicyNetwork, slots_of
+from marl_sched.agents.policies.cards import PolicyCard
+from marl_sched.agents.policies.checkpoint import load_network, save_network
+from marl_sched.agents.policies.network_policy import NetworkPolicy
 from marl_sched.agents.registry import create_scheduler
 from marl_sched.domain import Domain, get_domain
 from marl_sched.train.config import GaeConfig, ImitationConfig, RunRecord, StateValueConfig, load_record
-from marl_sched.train.evaluate import Settings, evaluate_scheduler
+from marl_sched.train.evaluation.evaluate import Settings, evaluate_scheduler
 
 CONFIG, BEST = "config.json", "policy.safetensors"  # in a run's directory
 

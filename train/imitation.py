@@ -3,7 +3,7 @@
 The policy that learns also plays, so that it meets its own mistakes (DAgger; Ross et al. 2011). In every state
 that it comes to the teacher, which may know more (the true state of what the agent sees late or not at all,
 the failure model), says what each choice is worth, A(a). The policy learns the distribution
-softmax(A / temperature) over legal targets by cross-entropy: the colder, the finer the differences that it must
+softmax(A / temperature) over legal actions by cross-entropy: the colder, the finer the differences that it must
 tell, and the surer the sign of a small advantage. That sign matters more than its size: a plane that is worth
 a little now and left standing is left standing again an hour later.
 
@@ -20,7 +20,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from marl_sched.agents.base import AdvantageScheduler
-from marl_sched.agents.learned.network import PolicyNetwork
+from marl_sched.agents.networks.network import PolicyNetwork
 from marl_sched.errors import InvalidOptionError
 from marl_sched.graph import ACTION_MASK
 from marl_sched.train.collect import Rollout
@@ -35,7 +35,7 @@ class Imitation:
     """Learns what a teacher would choose.
 
     Args:
-        policy: observation -> logits (N, n_targets).
+        policy: observation -> logits (N, n_actions).
         teacher: started on the simulator of the rollouts.
         config: see ImitationConfig.
     """
@@ -65,19 +65,19 @@ class Imitation:
 
     def _samples(self, rollout: Rollout, rng: np.random.Generator) -> TensorDict:
         samples, names, rows = thinned(self.policy, rollout, rollout.valid[:-1], self._config.keep_least, rng)
-        turns = rollout.targets.shape[0]
+        turns = rollout.actions.shape[0]
         truth = {name: v[:turns].flatten(0, 1)[rows].numpy() for name, v in rollout.central.items()}
         advantages = self._teacher.advantages(truth)
         if self._scale is None:
             self._scale = self._usual(advantages)
         scaled = torch.from_numpy(np.maximum(advantages / self._scale, LEAST)).float()
-        # A target that the agent may choose but that is taken in truth costs it the hour: as much as waiting.
+        # An action that the agent may choose but that is taken in truth costs it the hour: as much as waiting.
         scaled = torch.where(torch.from_numpy(truth[ACTION_MASK] != 0), scaled, 0.0)
         samples["advantage"] = scaled.gather(1, names)
         return samples
 
     def _usual(self, advantages: np.ndarray) -> float:
-        """What the best choice is worth on average, of advantages (N, n_targets): the unit of a run's temperatures."""
+        """What the best choice is worth on average, of advantages (N, n_actions): the unit of a run's temperatures."""
         usual = float(advantages.max(axis=1).mean())
         if usual <= 0.0:
             raise InvalidOptionError(
@@ -116,14 +116,14 @@ class Imitation:
 
 
 def cross_entropy(log_probs: Tensor, wanted: Tensor) -> Tensor:
-    """Of a policy relative to wanted distributions, both (N, n_targets), in nats, (N,).
+    """Of a policy relative to wanted distributions, both (N, n_actions), in nats, (N,).
 
-    Targets that are not legal have the lowest finite log-probability and are wanted with probability 0.
+    Actions that are not legal have the lowest finite log-probability and are wanted with probability 0.
     """
     return -(wanted * log_probs).sum(-1)
 
 
 def expected_advantage(log_probs: Tensor, advantages: Tensor, temperature: float) -> Tensor:
-    """The mean of finite advantages (N, n_targets) under a policy, and its entropy at a temperature, (N,)."""
+    """The mean of finite advantages (N, n_actions) under a policy, and its entropy at a temperature, (N,)."""
     probs = log_probs.exp()
     return (probs * advantages).sum(-1) + temperature * cross_entropy(log_probs, probs)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from marl_sched.agents.learned.network import PolicyNetwork
+from marl_sched.agents.networks.network import PolicyNetwork
 from marl_sched.errors import InvalidOptionError
 from marl_sched.train.collect import Rollout
 from marl_sched.train.estimators import Estimator
@@ -59,7 +59,7 @@ class PolicyGradient:
         if not estimate.counted.any():
             raise InvalidOptionError(
                 f"algorithm.turns: expected a segment in which turns can be told from what follows them, got one of "
-                f"{len(rollout.targets)} turns of which none can"
+                f"{len(rollout.actions)} turns of which none can"
             )
         samples = samples_of(self.policy, rollout, estimate, self._ppo.config.keep_least, rng)
         report = self._ppo.update(samples, progress, rng)

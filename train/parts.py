@@ -10,14 +10,14 @@ import numpy as np
 import torch
 
 from marl_sched.agents.base import AdvantageScheduler
-from marl_sched.agents.cards import DecimaSizes, DeepRMSizes, HetGATSizes, Sizes, check_graph
-from marl_sched.agents.hetgat.network import HetGATCritic
-from marl_sched.agents.learned.architectures import new_network
-from marl_sched.agents.learned.checkpoint import load_network
-from marl_sched.agents.learned.network import PolicyNetwork, slots_of
+from marl_sched.agents.networks.architectures import new_network
+from marl_sched.agents.networks.hetgat.network import HetGATCritic
+from marl_sched.agents.networks.network import PolicyNetwork, slots_of
+from marl_sched.agents.policies.cards import DecimaSizes, DeepRMSizes, HetGATSizes, Sizes, check_graph
+from marl_sched.agents.policies.checkpoint import load_network
 from marl_sched.agents.registry import create_scheduler, policy_path
 from marl_sched.domain import get_domain
-from marl_sched.envs.torchrl_env import SchedulingTorchRL
+from marl_sched.envs.api.torchrl_env import SchedulingTorchRL
 from marl_sched.errors import InvalidOptionError
 from marl_sched.train.checkpoint import Counters, load_checkpoint, save_checkpoint
 from marl_sched.train.collect import Collector, EpisodeCollector, InstanceSource, SegmentCollector

@@ -10,9 +10,9 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from marl_sched.agents.learned.compaction import compacted
-from marl_sched.agents.learned.network import PolicyNetwork
-from marl_sched.agents.learned.policy import inverse_distribution
+from marl_sched.agents.networks.compaction import compacted
+from marl_sched.agents.networks.network import PolicyNetwork
+from marl_sched.agents.policies.network_policy import inverse_distribution
 from marl_sched.errors import InvalidOptionError
 from marl_sched.graph import ACTION_MASK
 from marl_sched.train.advantages import normalised
@@ -49,7 +49,7 @@ class Sampler:
 
     @torch.inference_mode()
     def __call__(self, observation: dict[str, Tensor], uniform: np.ndarray) -> tuple[Tensor, Tensor]:
-        """Targets int64 (B,) and log-probabilities float32 (B,)."""
+        """Actions int64 (B,) and log-probabilities float32 (B,)."""
         visible, names = _as_read(self._network, observation)
         there = {name: values.to(self._device) for name, values in visible.items()}
         log_probs = self._network(there, self._weights).log_softmax(-1).cpu()
@@ -68,7 +68,7 @@ def thinned(
     the weights keep every sum's expectation. `keep_least` 1 keeps all.
 
     Raises InvalidOptionError if none is kept.
-    Returns the samples, the target that each decision node of theirs stands for, int64 (N, n_kept), and
+    Returns the samples, the action that each decision node of theirs stands for, int64 (N, n_kept), and
     the row of the flattened rollout (T B) that each comes from, int64 (N,).
     """
     certainty = torch.where(counted, rollout.log_probs, 0.0).exp()
@@ -93,7 +93,7 @@ def samples_of(
     def pick(values: Tensor) -> Tensor:
         return values.flatten(0, 1)[rows]
 
-    samples["target"] = (names == pick(rollout.targets)[:, None]).int().argmax(1)
+    samples["target"] = (names == pick(rollout.actions)[:, None]).int().argmax(1)
     samples["log_prob"] = pick(rollout.log_probs)
     samples["advantage"] = pick(normalised(estimate.advantages, estimate.counted)).float()
     if estimate.value_targets is not None:
@@ -109,22 +109,22 @@ def _picked(columns: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
 
 
 def _as_read(network: PolicyNetwork, observation: Mapping[str, Tensor]) -> tuple[Mapping[str, Tensor], Tensor]:
-    """Observations (N, ...) as small as the network can read them, and the targets' old names (see `compacted`)."""
-    if network.permutable:
+    """Observations (N, ...) as small as the network can read them, and the actions' old names (see `compacted`)."""
+    if network.permutation_equivariant:
         return compacted(network.spec, observation)
-    targets = observation[ACTION_MASK].shape
-    return observation, torch.arange(targets[1]).expand(targets)
+    actions = observation[ACTION_MASK].shape
+    return observation, torch.arange(actions[1]).expand(actions)
 
 
 def policy_loss(
-    logits: Tensor, targets: Tensor, old_log_probs: Tensor, advantages: Tensor, clip: float
+    logits: Tensor, actions: Tensor, old_log_probs: Tensor, advantages: Tensor, clip: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Per sample: minus the clipped surrogate of equation 6.8, the probability ratio, and the entropy, (N,) each.
 
-    logits float (N, n_targets), the lowest finite number where a target is not legal; the others (N,).
+    logits float (N, n_actions), the lowest finite number where an action is not legal; the others (N,).
     """
     log_probs = logits.log_softmax(-1)
-    ratio = (log_probs.gather(1, targets[:, None]).squeeze(1) - old_log_probs).exp()
+    ratio = (log_probs.gather(1, actions[:, None]).squeeze(1) - old_log_probs).exp()
     surrogate = torch.minimum(ratio * advantages, ratio.clamp(1 - clip, 1 + clip) * advantages)
     return -surrogate, ratio, -(log_probs.exp() * log_probs).sum(-1)
 
@@ -135,7 +135,7 @@ class Ppo:
     Both are on one device, to which the samples of an update are brought at once.
 
     Args:
-        policy: observation -> logits (N, n_targets).
+        policy: observation -> logits (N, n_actions).
         critic: central observation -> values (N,), or None.
         config: see PpoConfig.
 

@@ -13,16 +13,16 @@ import numpy as np
 import torch
 from msgspec import structs
 
-from marl_sched.agents.cards import source_revision
+from marl_sched.agents.policies.cards import source_revision
 from marl_sched.errors import InvalidOptionError
 from marl_sched.files import write_json
-from marl_sched.train.allocation import keep_freed_memory
 from marl_sched.train.checkpoint import Counters
 from marl_sched.train.collect import Rollout
 from marl_sched.train.config import RunRecord, load_config, load_record
 from marl_sched.train.device import described, device_of
 from marl_sched.train.export import CONFIG
 from marl_sched.train.logging import RunLog
+from marl_sched.train.malloc import keep_freed_memory
 from marl_sched.train.parts import Parts, build
 from marl_sched.train.ppo import Sampler
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
-from marl_sched.agents.hetgat.network import HetGATCritic
+from marl_sched.agents.networks.hetgat.network import HetGATCritic
 from marl_sched.graph import GraphSpec
 from marl_sched.train.advantages import returns_by_time
 from marl_sched.train.collect import Act, EpisodeCollector, Rollout

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from marl_sched.agents.learned.network import PolicyNetwork
-from marl_sched.agents.learned.policy import NetworkPolicy
+from marl_sched.agents.networks.network import PolicyNetwork
+from marl_sched.agents.policies.network_policy import NetworkPolicy
 from marl_sched.domain import Domain, get_domain
 from marl_sched.train.config import TrainConfig
-from marl_sched.train.evaluate import Settings, evaluate_scheduler
+from marl_sched.train.evaluation.evaluate import Settings, evaluate_scheduler
 
 
 class Validation:

@@ -43,9 +43,9 @@ class PlanningScheduler(Scheduler):
         self._rounds[rows] = -1
 
     def decide(self, simulator: TurnSimulator) -> np.ndarray:
-        """Targets int64 (B,)."""
+        """Actions int64 (B,)."""
         murse = as_murse(simulator)
-        targets = np.zeros(murse.batch, np.int64)
+        actions = np.zeros(murse.batch, np.int64)
         rounds = murse.state.rows["round"]
         for row in np.flatnonzero(murse.acting != NOBODY).tolist():
             plan = self._plans[row]
@@ -54,12 +54,12 @@ class PlanningScheduler(Scheduler):
             else:
                 plan = self.revise(murse, row, plan)
             self._plans[row] = plan
-            targets[row] = next_target(murse, row, plan)
-        return targets
+            actions[row] = next_action(murse, row, plan)
+        return actions
 
 
-def next_target(simulator: MurseSimulator, row: int, plan: Plan) -> int:
-    """The acting agent's next target by the plan: the slot of its next task, or 0 while that has to wait."""
+def next_action(simulator: MurseSimulator, row: int, plan: Plan) -> int:
+    """The acting agent's next action by the plan: the slot of its next task, or 0 while that has to wait."""
     agent = int(simulator.acting[row])
     done = simulator.state.tasks["agent"][row] != NOBODY
     own = plan.tasks[(plan.agents == agent) & ~done[plan.tasks]]

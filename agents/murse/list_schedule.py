@@ -36,7 +36,7 @@ def preference(durations: np.ndarray, done: np.ndarray, picking: int, agent: int
 
 
 @njit(cache=True)
-def next_moment(clock: int, order: np.ndarray, count: int, lags: np.ndarray, finish: np.ndarray) -> int:
+def next_event_time(clock: int, order: np.ndarray, count: int, lags: np.ndarray, finish: np.ndarray) -> int:
     """When the next dispatched task ends or wait elapses after `clock`; NEVER if none does."""
     wakes = NEVER
     for k in range(count):
@@ -112,7 +112,7 @@ def dispatch_all(
         since[agent] = NOT_WAITING
         task = best_startable(priority, agent, clock, durations, lags, near, done, order, count, finish)
         if task < 0:
-            free_at[agent], since[agent] = next_moment(clock, order, count, lags, finish), clock
+            free_at[agent], since[agent] = next_event_time(clock, order, count, lags, finish), clock
             continue
         order[count], doers[task], done[task] = task, agent, True
         count += 1

@@ -6,11 +6,11 @@ from abc import abstractmethod
 
 import numpy as np
 
-from marl_sched.agents.auctions.cbba import CbbaBidder
-from marl_sched.agents.auctions.diary import UNKNOWN, Diary
-from marl_sched.agents.auctions.network import Bidder, hearing, negotiate
-from marl_sched.agents.auctions.tessi import TessiBidder
 from marl_sched.agents.base import Scheduler
+from marl_sched.agents.murse.auctions.agent_schedule import UNKNOWN, AgentSchedule
+from marl_sched.agents.murse.auctions.cbba import CbbaBidder
+from marl_sched.agents.murse.auctions.network import Bidder, hearing, negotiate
+from marl_sched.agents.murse.auctions.tessi import TessiBidder
 from marl_sched.agents.murse.snapshot import as_murse, estimated_round
 from marl_sched.agents.murse.traffic import Traffic
 from marl_sched.agents.murse.windows import induced_deadlines
@@ -25,7 +25,7 @@ _TURNS_PER_TASK = 100
 class NegotiatingScheduler(Scheduler):
     """Negotiates on estimated durations at the beginning of every round; `bidder` is what a subclass adds.
 
-    Before a round agents hear those within `radius` of their stations (marl_sched.agents.auctions.network), None:
+    Before a round agents hear those within `radius` of their stations (marl_sched.agents.murse.auctions.network), None:
     as far as the simulator's view lets them, so everybody under the full view. Afterwards they say nothing more:
     an agent comes to a task that another one has taken if it did not hear of it, which is a conflict, and then
     crosses it off its list.
@@ -44,10 +44,10 @@ class NegotiatingScheduler(Scheduler):
         self._radius = radius
         self.traffic = Traffic()
         self._rounds = np.empty(0, np.int64)
-        self._diaries: list[list[Diary]] = []
+        self._diaries: list[list[AgentSchedule]] = []
 
     @abstractmethod
-    def bidder(self, diary: Diary, n_agents: int) -> Bidder:
+    def bidder(self, schedule: AgentSchedule, n_agents: int) -> Bidder:
         """An agent's side of the negotiation."""
 
     def per_round(self) -> dict[str, np.ndarray]:
@@ -62,65 +62,66 @@ class NegotiatingScheduler(Scheduler):
         self._rounds[rows] = -1
 
     def decide(self, simulator: TurnSimulator) -> np.ndarray:
-        """Targets int64 (B,): each acting agent's next task by its own diary."""
-        murse, targets = as_murse(simulator), np.zeros(simulator.batch, np.int64)
+        """Actions int64 (B,): each acting agent's next task by its own schedule."""
+        murse, actions = as_murse(simulator), np.zeros(simulator.batch, np.int64)
         rounds = murse.state.rows["round"]
         for row in np.flatnonzero(murse.acting != NOBODY).tolist():
             if self._rounds[row] != rounds[row]:
                 self._negotiate(murse, row)
                 self._rounds[row] = rounds[row]
-            targets[row] = next_own(murse, row, self._diaries[row][int(murse.acting[row])])
-        return targets
+            actions[row] = next_own(murse, row, self._diaries[row][int(murse.acting[row])])
+        return actions
 
     def _negotiate(self, simulator: MurseSimulator, row: int) -> None:
         problem, instance = estimated_round(simulator, row), simulator.instances[row]
         deadlines = induced_deadlines(problem)
-        diaries = [
-            Diary(agent, problem.durations, problem.lags, problem.near, deadlines) for agent in range(problem.n_agents)
+        schedules = [
+            AgentSchedule(agent, problem.durations, problem.lags, problem.near, deadlines)
+            for agent in range(problem.n_agents)
         ]
-        bidders = [self.bidder(diary, problem.n_agents) for diary in diaries]
+        bidders = [self.bidder(schedule, problem.n_agents) for schedule in schedules]
         radius = simulator.view.limits[1] if self._radius is None else self._radius
         hears = hearing(problem.n_agents, instance.map_width, radius)
         talk = negotiate(bidders, hears, _TURNS_PER_TASK * problem.n_tasks)
         self.traffic.add(simulator, row, talk.messages, talk.bytes)
-        self._diaries[row] = diaries
+        self._diaries[row] = schedules
 
 
-def next_own(simulator: MurseSimulator, row: int, diary: Diary) -> int:
-    """The target of the next task on an agent's own list, or 0 while it has to wait.
+def next_own(simulator: MurseSimulator, row: int, schedule: AgentSchedule) -> int:
+    """The action of the next task on an agent's own list, or 0 while it has to wait.
 
     It goes for a task that is taken if it has not heard of that. It waits until what the task waits for and near
     tasks that it believes to come before have been dispatched.
     """
-    agent, tasks = diary.agent, simulator.state.tasks
+    agent, tasks = schedule.agent, simulator.state.tasks
     holders = tasks["agent"][row]
-    told = simulator.state.told[row, agent, :, 1] >= 0
-    for task in diary.path:
+    told = simulator.state.private_memory[row, agent, :, 1] >= 0
+    for task in schedule.path:
         if holders[task] == agent or told[task]:
             continue
         if holders[task] != NOBODY:
             return task + 1
-        before = (diary.starts != UNKNOWN) & (diary.starts < diary.starts[task]) & diary.near[task]
+        before = (schedule.starts != UNKNOWN) & (schedule.starts < schedule.starts[task]) & schedule.near[task]
         open_before = before & (holders[: len(before)] == NOBODY)
         return 0 if open_before.any() or not simulator.dispatchable(row, task, agent) else task + 1
     return 0
 
 
 class Tessi(NegotiatingScheduler):
-    """Sequential single-item auctions with a temporal-network test, see marl_sched.agents.auctions.tessi."""
+    """Sequential single-item auctions with a temporal-network test, see marl_sched.agents.murse.auctions.tessi."""
 
     name = "tessi"
 
-    def bidder(self, diary: Diary, n_agents: int) -> Bidder:
+    def bidder(self, schedule: AgentSchedule, n_agents: int) -> Bidder:
         """A bidder of TeSSI."""
-        return TessiBidder(diary)
+        return TessiBidder(schedule)
 
 
 class Cbba(NegotiatingScheduler):
-    """The consensus-based bundle algorithm with a temporal-network test, see marl_sched.agents.auctions.cbba."""
+    """The consensus-based bundle algorithm with a temporal-network test, see marl_sched.agents.murse.auctions.cbba."""
 
     name = "cbba"
 
-    def bidder(self, diary: Diary, n_agents: int) -> Bidder:
+    def bidder(self, schedule: AgentSchedule, n_agents: int) -> Bidder:
         """A bidder of CBBA."""
-        return CbbaBidder(diary, n_agents)
+        return CbbaBidder(schedule, n_agents)

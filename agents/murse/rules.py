@@ -12,7 +12,7 @@ from types import MappingProxyType
 import msgspec
 import numpy as np
 
-from marl_sched.agents.base import ObservationScheduler, Scheduler, best_target
+from marl_sched.agents.base import ObservationScheduler, Scheduler, best_action
 from marl_sched.agents.murse.list_schedule import NO_DEADLINE_PRIORITY
 from marl_sched.agents.murse.snapshot import as_murse, estimated_round
 from marl_sched.agents.murse.traffic import Traffic
@@ -24,7 +24,7 @@ Observation = Mapping[str, np.ndarray]
 
 
 def legal_tasks(observation: Observation) -> np.ndarray:
-    """Bool (B, T), the targets that are legal, `wait` left out."""
+    """Bool (B, T), the actions that are legal, `wait` left out."""
     legal = np.asarray(observation["action_mask"]) > 0
     legal[:, 0] = False
     return legal
@@ -37,9 +37,9 @@ class PriorityRule(ObservationScheduler):
         self.name, self._priority = name, priority
 
     def choose(self, observation: Observation, uniform: np.ndarray) -> np.ndarray:
-        """Targets int64 (B,), ties to the lower index; `uniform` is not used."""
+        """Actions int64 (B,), ties to the lower index; `uniform` is not used."""
         tasks = np.asarray(observation["task"], np.float64)
-        return best_target(self._priority(tasks), legal_tasks(observation) & (tasks[..., EARLIEST_START] <= 0))
+        return best_action(self._priority(tasks), legal_tasks(observation) & (tasks[..., EARLIEST_START] <= 0))
 
 
 def edf() -> PriorityRule:
@@ -63,7 +63,7 @@ class RandomRule(ObservationScheduler):
     samples = True
 
     def choose(self, observation: Observation, uniform: np.ndarray) -> np.ndarray:
-        """Targets int64 (B,) by inverse distribution from `uniform` float64 (B,)."""
+        """Actions int64 (B,) by inverse distribution from `uniform` float64 (B,)."""
         legal = legal_tasks(observation)
         rank = np.floor(uniform * legal.sum(axis=1)).astype(np.int64)
         return np.asarray((legal.cumsum(axis=1) > rank[:, None]).argmax(axis=1), np.int64)
@@ -86,18 +86,18 @@ class EdfPublished(Scheduler):
 
     def start(self, simulator: TurnSimulator, rows: np.ndarray) -> None:
         """Forget the rows' initial networks."""
-        if self._finish.shape != (simulator.batch, simulator.max_agents, simulator.max_targets):
+        if self._finish.shape != (simulator.batch, simulator.max_agents, simulator.max_actions):
             self._rounds = np.full(simulator.batch, -1)
-            self._finish = np.zeros((simulator.batch, simulator.max_agents, simulator.max_targets))
+            self._finish = np.zeros((simulator.batch, simulator.max_agents, simulator.max_actions))
         self._rounds[rows] = -1
 
     def decide(self, simulator: TurnSimulator) -> np.ndarray:
-        """Targets int64 (B,)."""
+        """Actions int64 (B,)."""
         observation = simulator.observe(simulator.acting)
         self._look_at_new_rounds(as_murse(simulator))
         now = np.asarray(observation["task"])[..., EARLIEST_START] <= 0
         finish = self._finish[np.arange(simulator.batch), simulator.acting]
-        return best_target(-finish, legal_tasks(observation) & now)
+        return best_action(-finish, legal_tasks(observation) & now)
 
     def _look_at_new_rounds(self, simulator: MurseSimulator) -> None:
         rounds = simulator.state.rows["round"]
@@ -133,17 +133,17 @@ class FirstClaim(ObservationScheduler):
         self.traffic.restart(as_murse(simulator), rows)
 
     def choose(self, observation: Observation, uniform: np.ndarray) -> np.ndarray:
-        """Targets int64 (B,), ties to the lower index; `uniform` is not used."""
-        return best_target(-np.asarray(observation["task"], np.float64)[..., EARLIEST_FINISH], legal_tasks(observation))
+        """Actions int64 (B,), ties to the lower index; `uniform` is not used."""
+        return best_action(-np.asarray(observation["task"], np.float64)[..., EARLIEST_FINISH], legal_tasks(observation))
 
     def per_round(self) -> dict[str, np.ndarray]:
         """Messages and bytes."""
         return self.traffic.per_round()
 
     def decide(self, simulator: TurnSimulator) -> np.ndarray:
-        """Targets int64 (B,), each claim counted."""
-        targets = super().decide(simulator)
-        for row in np.flatnonzero(targets):
-            claim = Claim(int(simulator.acting[row]), int(targets[row]), int(simulator.time[row]))
+        """Actions int64 (B,), each claim counted."""
+        actions = super().decide(simulator)
+        for row in np.flatnonzero(actions):
+            claim = Claim(int(simulator.acting[row]), int(actions[row]), int(simulator.time[row]))
             self.traffic.add(as_murse(simulator), int(row), 1, len(msgspec.msgpack.encode(claim)))
-        return targets
+        return actions

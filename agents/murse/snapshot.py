@@ -38,7 +38,7 @@ def remaining_round(simulator: MurseSimulator, row: int) -> Round:
     n, clock = whole.n_tasks, int(state.rows["clock"][row])
     agents = state.tasks["agent"][row, :n].copy()
     taken = np.flatnonzero(agents != NOBODY)
-    start, finish = np.zeros((2, simulator.max_targets), np.int64)
+    start, finish = np.zeros((2, simulator.max_actions), np.int64)
     heard = np.ones(simulator.max_agents, np.bool_)
     viewer = int(simulator.acting[row])
     believes(state, simulator.rules, row, viewer, heard, state.tasks["agent"][row] != NOBODY, start, finish)

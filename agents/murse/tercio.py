@@ -2,8 +2,8 @@
 
 The program minimises the largest workload of an agent. The sequencer takes tasks in order of the latest finish
 that the temporal network leaves them. Before it, an analytical test asks whether each agent's work can end in time:
-the tasks that have to be done by some moment must fit between the earliest time at which one of them can start
-and that moment, for every such moment, one window inside the next. What fails is cut off, and the program is solved
+the tasks that have to be done by some time must fit between the earliest time at which one of them can start
+and that time, for every such time, one window inside the next. What fails is cut off, and the program is solved
 again.
 
 Where this differs from the paper: its sequencer tests before every single dispatch whether the open tasks still
@@ -81,9 +81,9 @@ def overload(
     """
     for agent in range(problem.n_agents):
         own = np.flatnonzero(doers == agent)
-        for moment in np.unique(latest[own]):
-            due = own[latest[own] <= moment]
-            if earliest[due].min() + problem.durations[due, agent].sum() > moment:
+        for latest_finish in np.unique(latest[own]):
+            due = own[latest[own] <= latest_finish]
+            if earliest[due].min() + problem.durations[due, agent].sum() > latest_finish:
                 return due, doers[due]
     return None
 

@@ -14,31 +14,31 @@ if TYPE_CHECKING:
 
 
 class HourlyDecisions:
-    """A joint action is a target for each crew, int64 (C,); one step is one hour.
+    """A joint action is an action for each crew, int64 (C,); one step is one hour.
 
-    Targets of busy crews are ignored. A plane that is in somebody's hands, chosen by a lower crew this hour or
+    Actions of busy crews are ignored. A plane that is in somebody's hands, chosen by a lower crew this hour or
     not of this fleet idles its crew, whose index the step's infos list under `illegal`. Free crews decide in
-    ascending order; under the scheme `skip` the first target 0 ends the hour's decisions, under `single` the
-    first decision does, and the targets of the remaining crews are ignored (section 6.3.1).
+    ascending order; under the scheme `skip` the first action 0 ends the hour's decisions, under `single` the
+    first decision does, and the actions of the remaining crews are ignored (section 6.3.1).
     """
 
     def action_space(self, simulator: AirmeSimulator) -> spaces.MultiDiscrete:
         """`MultiDiscrete([P + 1] * C)`, padded like the simulator."""
-        return spaces.MultiDiscrete(np.full(simulator.max_agents, simulator.max_targets))
+        return spaces.MultiDiscrete(np.full(simulator.max_agents, simulator.max_actions))
 
     def play(self, simulator: AirmeSimulator, action: Any) -> tuple[float, dict[str, Any]]:
-        """Play one hour of row 0; the reward of the hour, and which crews idled for an impossible target."""
+        """Play one hour of row 0; the reward of the hour, and which crews idled for an impossible action."""
         choices = np.full(simulator.max_agents, IDLE, np.int64)
         planes = simulator.state.planes[0]
         illegal = []
         taken: set[int] = set()
         for crew in simulator.free_agents(0):
-            target = choices[crew] = int(action[crew])
-            if target != IDLE:
-                if target > simulator.state.rows["n_planes"][0] or planes["crew"][target] >= 0 or target in taken:
+            plane = choices[crew] = int(action[crew])
+            if plane != IDLE:
+                if plane > simulator.state.rows["n_planes"][0] or planes["crew"][plane] >= 0 or plane in taken:
                     illegal.append(int(crew))
-                taken.add(target)
-            if simulator.scheme == "single" or (simulator.scheme == "skip" and target == IDLE):
+                taken.add(plane)
+            if simulator.scheme == "single" or (simulator.scheme == "skip" and plane == IDLE):
                 break
         simulator.play_hour(choices[None])
         return float(simulator.reward[0]), {"illegal": illegal}

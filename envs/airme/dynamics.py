@@ -1,6 +1,6 @@
 """The AirME simulator as compiled kernels over plain arrays (dissertation, section 6.2).
 
-Slot 0 of `planes` is the null plane, slots 1..n_planes are the fleet, so a target is a slot. Everything is
+Slot 0 of `planes` is the null plane, slots 1..n_planes are the fleet, so an action is a slot. Everything is
 integer hours and float64 money. The order of events within an hour and the facts that the dissertation
 leaves open are written beside the lines that implement them.
 """
@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 
-from marl_sched.noise import FIRST_DOMAIN_STREAM, integer, moment_key, uniform
+from marl_sched.noise import FIRST_DOMAIN_STREAM, integer, time_key, uniform
 
 Record = Any  # one element of a record array, whose fields compiled code reads as attributes
 
@@ -39,7 +39,7 @@ CREW = np.dtype(
         ("plane", np.int32),  # the slot under repair, 0: free
         ("job_hours", np.int32),
         ("job_done", np.int32),
-        ("choice", np.int32),  # this hour's target, IDLE or UNDECIDED
+        ("choice", np.int32),  # this hour's action, IDLE or UNDECIDED
     ],
     align=True,
 )
@@ -88,8 +88,8 @@ class State(NamedTuple):
     series: np.ndarray  # float64 (B, T, 3), objectives of each hour
     timeline: np.ndarray  # uint8 (B, T, P + 1), what each plane did, or (0, 0, 0): not recorded
     past: np.ndarray  # PLANE (B, H + 1, P + 1), planes at the start of hour t in slot t mod (H + 1), or (B, 0, P + 1)
-    told: np.ndarray  # PLANE (B, C, P + 1), statuses that a crew learnt by itself, or (0, 0, 0)
-    told_at: np.ndarray  # int64 (B, C, P + 1), hour of that status, -1: never, or (0, 0, 0)
+    private_memory: np.ndarray  # PLANE (B, C, P + 1), statuses that a crew learnt by itself, or (0, 0, 0)
+    private_memory_at: np.ndarray  # int64 (B, C, P + 1), hour of that status, -1: never, or (0, 0, 0)
 
 
 class Rules(NamedTuple):
@@ -119,12 +119,12 @@ _MISSION, _MISSION_HOURS, _FAILURE = int(Stream.MISSION), int(Stream.MISSION_HOU
 
 
 @njit(cache=True, inline="always")
-def start_repair(plane: Record, slot: int, crew: int, moment: np.uint64) -> None:
+def start_repair(plane: Record, slot: int, crew: int, time_word: np.uint64) -> None:
     """Send a crew to a plane: draw the job's hours, then its cost; a running mission ends without a landing."""
-    hours = integer(uniform(moment, _REPAIR_HOURS, slot, 0), REPAIR_HOURS[0], REPAIR_HOURS[1])
+    hours = integer(uniform(time_word, _REPAIR_HOURS, slot, 0), REPAIR_HOURS[0], REPAIR_HOURS[1])
     hours += plane.hours // HOURS_PER_REPAIR_HOUR + plane.landings // LANDINGS_PER_REPAIR_HOUR
     low, high = COST_SHARE_OF_INCOME
-    cost = (low + (high - low) * uniform(moment, _REPAIR_COST, slot, 0)) * plane.income
+    cost = (low + (high - low) * uniform(time_word, _REPAIR_COST, slot, 0)) * plane.income
     if plane.broken:
         hours += BROKEN_REPAIR_HOURS
         cost += BROKEN_COST
@@ -138,27 +138,27 @@ def start_repair(plane: Record, slot: int, crew: int, moment: np.uint64) -> None
 
 
 @njit(cache=True, inline="always")
-def fails(plane: Record, slot: int, failure: np.ndarray, moment: np.uint64) -> bool:
+def fails(plane: Record, slot: int, failure: np.ndarray, time_word: np.uint64) -> bool:
     """Whether a part of a flying plane fails this hour, on the counters as they stood before the hour (eq. 6.1)."""
     for part in range(failure.shape[1]):
         usage = plane.landings if part == 0 else plane.hours
         probability = failure[plane.kind, part, usage]
-        if probability > 0.0 and uniform(moment, _FAILURE, slot, part) < probability:
+        if probability > 0.0 and uniform(time_word, _FAILURE, slot, part) < probability:
             return True
     return False
 
 
 @njit(cache=True, inline="always")
-def fly(plane: Record, slot: int, usage: np.ndarray, failure: np.ndarray, moment: np.uint64) -> None:
+def fly(plane: Record, slot: int, usage: np.ndarray, failure: np.ndarray, time_word: np.uint64) -> None:
     """A plane's hour outside repair: it may start a mission, and while it flies it may fail."""
     if plane.broken:
         return
-    if plane.mission_hours == 0 and uniform(moment, _MISSION, slot, 0) < usage[plane.kind]:
-        plane.mission_hours = integer(uniform(moment, _MISSION_HOURS, slot, 0), MISSION_HOURS[0], MISSION_HOURS[1])
+    if plane.mission_hours == 0 and uniform(time_word, _MISSION, slot, 0) < usage[plane.kind]:
+        plane.mission_hours = integer(uniform(time_word, _MISSION_HOURS, slot, 0), MISSION_HOURS[0], MISSION_HOURS[1])
         plane.mission_done = 0
     if plane.mission_hours == 0:
         return
-    if fails(plane, slot, failure, moment):
+    if fails(plane, slot, failure, time_word):
         plane.broken = True  # counters stand still until the repair, and the mission ends without a landing
         plane.mission_hours = 0
         plane.mission_done = 0
@@ -198,14 +198,14 @@ def hour(
     float64 (n_types, parts, longest + 1), status uint8 (P + 1,) or (0,): what each plane did. Decisions apply
     first and their hour is the first hour of repair.
     """
-    moment = moment_key(row.episode, row.time)
+    time_word = time_key(row.episode, row.time)
     for crew in range(row.n_crews):
-        target = crews[crew].choice
+        action = crews[crew].choice
         crews[crew].choice = UNDECIDED
-        if target > 0:
-            start_repair(planes[target], target, crew, moment)
-            crews[crew].plane = target
-            crews[crew].job_hours = planes[target].job_hours
+        if action > 0:
+            start_repair(planes[action], action, crew, time_word)
+            crews[crew].plane = action
+            crews[crew].job_hours = planes[action].job_hours
             crews[crew].job_done = 0
     income = 0.0
     cost = 0.0
@@ -219,7 +219,7 @@ def hour(
             crews[plane.crew].job_done = plane.job_done
             cost += plane.job_cost
         else:
-            fly(plane, slot, usage, failure, moment)
+            fly(plane, slot, usage, failure, time_word)
             if plane.mission_hours > 0:
                 income += plane.income
             if not plane.broken:
@@ -251,20 +251,20 @@ def next_free(crews: np.ndarray, n_crews: int) -> int:
 
 
 @njit(cache=True)
-def decide(state: State, b: int, crew: int, target: int) -> None:
+def decide(state: State, b: int, crew: int, action: int) -> None:
     """Note a crew's choice in row b; one that is impossible in truth idles the crew for this hour."""
     row, planes = state.rows[b], state.planes[b]
-    if target == IDLE:
+    if action == IDLE:
         state.crews[b, crew].choice = IDLE
-    elif target <= row.n_planes and planes[target].crew < 0 and planes[target].chosen < 0:
-        state.crews[b, crew].choice = target
-        planes[target].chosen = crew
+    elif action <= row.n_planes and planes[action].crew < 0 and planes[action].chosen < 0:
+        state.crews[b, crew].choice = action
+        planes[action].chosen = crew
     else:
         row.conflict = True
         state.crews[b, crew].choice = IDLE
-        if target <= row.n_planes and state.told_at.shape[0] > 0:
-            state.told[b, crew, target] = planes[target]
-            state.told_at[b, crew, target] = row.time
+        if action <= row.n_planes and state.private_memory_at.shape[0] > 0:
+            state.private_memory[b, crew, action] = planes[action]
+            state.private_memory_at[b, crew, action] = row.time
 
 
 @njit(cache=True)
@@ -301,8 +301,8 @@ def pass_hour_with_memory(state: State, rules: Rules, b: int) -> None:
     for crew in range(row.n_crews):
         slot = jobs[crew]
         if slot > 0 and crews[crew].plane == 0:
-            state.told[b, crew, slot] = state.planes[b, slot]
-            state.told_at[b, crew, slot] = row.time
+            state.private_memory[b, crew, slot] = state.planes[b, slot]
+            state.private_memory_at[b, crew, slot] = row.time
 
 
 @njit(cache=True)
@@ -314,18 +314,18 @@ def begin_step(row: Record) -> None:
 
 
 @njit(cache=True)
-def step(state: State, rules: Rules, targets: np.ndarray) -> None:
+def step(state: State, rules: Rules, actions: np.ndarray) -> None:
     """Take a turn, int64 (B,), in every row that is not over and let hours pass until a crew of it is free."""
-    for b in range(targets.shape[0]):
+    for b in range(actions.shape[0]):
         row = state.rows[b]
         begin_step(row)
         if row.acting < 0:
             continue
-        decide(state, b, row.acting, targets[b])
-        ends = rules.scheme == SINGLE or (rules.scheme == SKIP and targets[b] == IDLE)
+        decide(state, b, row.acting, actions[b])
+        ends = rules.scheme == SINGLE or (rules.scheme == SKIP and actions[b] == IDLE)
         following = -1 if ends else next_free(state.crews[b], row.n_crews)
         while following < 0 and not row.terminated and not row.truncated:
-            if state.told_at.shape[0] > 0:
+            if state.private_memory_at.shape[0] > 0:
                 pass_hour_with_memory(state, rules, b)
             else:
                 pass_hour(state, rules, b)
@@ -334,22 +334,22 @@ def step(state: State, rules: Rules, targets: np.ndarray) -> None:
 
 
 @njit(cache=True)
-def first_outside(targets: np.ndarray, n_targets: int) -> int:
-    """Index of the first of targets, int64 (N,), that is not in [0, n_targets), -1 if there is none.
+def first_outside(actions: np.ndarray, n_actions: int) -> int:
+    """Index of the first of actions, int64 (N,), that is not in [0, n_actions), -1 if there is none.
 
     Two reductions in NumPy would cost as much as an hour of a small fleet.
     """
-    for i in range(targets.shape[0]):
-        if targets[i] < 0 or targets[i] >= n_targets:
+    for i in range(actions.shape[0]):
+        if actions[i] < 0 or actions[i] >= n_actions:
             return i
     return -1
 
 
 @njit(cache=True)
 def play_hour(state: State, rules: Rules, choices: np.ndarray) -> None:
-    """Play one hour in every row that is not over, with a target for each crew, int64 (B, C).
+    """Play one hour in every row that is not over, with an action for each crew, int64 (B, C).
 
-    This is the centralised interface of section 6.2.4: targets of busy crews are ignored, impossible ones idle
+    This is the centralised interface of section 6.2.4: actions of busy crews are ignored, impossible ones idle
     the crew. Afterwards `acting` is the first free crew, -1 if all are busy.
     """
     for b in range(choices.shape[0]):
@@ -360,7 +360,7 @@ def play_hour(state: State, rules: Rules, choices: np.ndarray) -> None:
         for crew in range(row.n_crews):
             if state.crews[b, crew].plane == 0:
                 decide(state, b, crew, choices[b, crew])
-        if state.told_at.shape[0] > 0:
+        if state.private_memory_at.shape[0] > 0:
             pass_hour_with_memory(state, rules, b)
         else:
             pass_hour(state, rules, b)

@@ -85,7 +85,7 @@ def observe(state: State, usage: np.ndarray, agents: np.ndarray, limits: np.ndar
             see_crews(state, b, agents[b], comm, out)
             see_planes(state, usage, b, agents[b], reach, staleness, out)
             hear_of_jobs(state, b, out)
-            offer(state, b, agents[b], out)
+            write_action_mask(state, b, agents[b], out)
             summarise(out, b, state.rows[b].n_planes)
         else:
             out.plane[b] = 0
@@ -115,7 +115,7 @@ def see_planes(state: State, usage: np.ndarray, b: int, agent: int, reach: int, 
     """Planes of the sectors within `reach`, each as this crew knows it; all others are zero."""
     row = state.rows[b]
     n_crews, now = row.n_crews, row.time
-    pictured = max(0, now - staleness)
+    snapshot_hour = max(0, now - staleness)
     out.plane[b, 0] = 0
     out.plane[b, 0, 15] = 1
     out.plane_mask[b, 0] = 1
@@ -131,19 +131,28 @@ def see_planes(state: State, usage: np.ndarray, b: int, agent: int, reach: int, 
         out.plane_mask[b, slot] = 1
         if sector == agent or staleness == 0:
             describe(state.planes[b, slot], usage, 0, out.plane, b, slot)
-        elif state.told_at[b, agent, slot] >= pictured:
-            describe(state.told[b, agent, slot], usage, now - state.told_at[b, agent, slot], out.plane, b, slot)
+        elif state.private_memory_at[b, agent, slot] >= snapshot_hour:
+            describe(
+                state.private_memory[b, agent, slot],
+                usage,
+                now - state.private_memory_at[b, agent, slot],
+                out.plane,
+                b,
+                slot,
+            )
         else:
-            describe(state.past[b, pictured % state.past.shape[1], slot], usage, now - pictured, out.plane, b, slot)
+            describe(
+                state.past[b, snapshot_hour % state.past.shape[1], slot], usage, now - snapshot_hour, out.plane, b, slot
+            )
     out.visible_share[b] = visible / row.n_planes
 
 
 @njit(cache=True, inline="always")
 def describe(plane: Record, usage: np.ndarray, age: int, out: np.ndarray, b: int, slot: int) -> None:
-    """A plane's features from its record; `age` is how many hours old the picture is.
+    """A plane's features from its record; `age` is how many hours old the snapshot is.
 
-    Whose choice it is this hour is not in the picture: that is heard from crews within `comm`. A told status
-    says so nevertheless, as somebody has the plane in hand.
+    Whose choice it is this hour is not in the delayed snapshot: that is heard from crews within `comm`. A status in
+    the private memory says so nevertheless, as somebody has the plane in hand.
     """
     in_hand = plane.crew >= 0 or (age > 0 and plane.chosen >= 0)
     out[b, slot, 0] = plane.hours * TENTH
@@ -168,7 +177,7 @@ def describe(plane: Record, usage: np.ndarray, age: int, out: np.ndarray, b: int
 
 @njit(cache=True)
 def hear_of_jobs(state: State, b: int, out: Arrays) -> None:
-    """What a visible crew says of its own work is newer than any picture of the plane."""
+    """What a visible crew says of its own work is newer than any delayed snapshot of the plane."""
     for crew in range(state.rows[b].n_crews):
         if out.crew_mask[b, crew] == 0:
             continue
@@ -187,8 +196,8 @@ def hear_of_jobs(state: State, b: int, out: Arrays) -> None:
 
 
 @njit(cache=True)
-def offer(state: State, b: int, agent: int, out: Arrays) -> None:
-    """The targets that are legal as far as the crew knows: visible planes that nobody has in hand."""
+def write_action_mask(state: State, b: int, agent: int, out: Arrays) -> None:
+    """The actions that are legal as far as the crew knows: visible planes that nobody has in hand."""
     if state.crews[b, agent].plane > 0 or state.crews[b, agent].choice != UNDECIDED:
         return
     for slot in range(1, state.rows[b].n_planes + 1):

@@ -30,7 +30,7 @@ class AirmeSimulator(TurnSimulator):
         horizon: hours of an episode, its truncation.
         seed: of the first episode's noise.
         pad: a scale whose largest instance sets the padding; None pads to the largest of `instances`.
-        scheme: "full", "skip" (target 0 ends the hour's decisions) or "single" (one decision an hour),
+        scheme: "full", "skip" (action 0 ends the hour's decisions) or "single" (one decision an hour),
             section 6.3.1.
         failure: "density" as published, or "hazard".
         stop_share: an episode terminates when this share of planes is broken; None: never.
@@ -63,7 +63,7 @@ class AirmeSimulator(TurnSimulator):
         self._no_limits = np.tile(np.array(FullView().limits), (self.batch, 1))
         planes = SCALES[pad].max_planes if pad else max(i.n_planes for i in self.instances)
         crews = SCALES[pad].crews[1] if pad else max(i.n_crews for i in self.instances)
-        self.max_targets, self.max_agents = planes + 1, crews
+        self.max_actions, self.max_agents = planes + 1, crews
         self.graph = graph.graph_spec(len(self.types))
         self.arrays = self.graph.arrays({"plane": planes + 1, "crew": crews})
         self.state = _new_state(self.batch, planes, crews, horizon, self.view.memory, record_timeline)
@@ -145,10 +145,10 @@ class AirmeSimulator(TurnSimulator):
         if instance.types != self.types:
             raise InvalidOptionError(f"instances[{b}]: aircraft types differ from those of the other rows")
         n_planes, n_crews = instance.n_planes, instance.n_crews
-        if n_planes >= self.max_targets or n_crews > self.max_agents:
+        if n_planes >= self.max_actions or n_crews > self.max_agents:
             raise InvalidOptionError(
                 f"instances[{b}]: {n_planes} planes and {n_crews} crews exceed the padding of "
-                f"{self.max_targets - 1} planes and {self.max_agents} crews"
+                f"{self.max_actions - 1} planes and {self.max_agents} crews"
             )
         planes = state.planes[b]
         planes[:] = 0
@@ -170,29 +170,29 @@ class AirmeSimulator(TurnSimulator):
             state.timeline[b] = 0
         if state.past.shape[1]:
             state.past[b] = planes
-        if len(state.told_at):
-            state.told_at[b] = -1
+        if len(state.private_memory_at):
+            state.private_memory_at[b] = -1
 
-    def step(self, targets: np.ndarray) -> None:
+    def step(self, actions: np.ndarray) -> None:
         """Take one turn in every row; see TurnSimulator.step."""
-        dynamics.step(self.state, self.rules, self._checked(targets, (self.batch,)))
+        dynamics.step(self.state, self.rules, self._checked(actions, (self.batch,)))
 
     def play_hour(self, choices: np.ndarray) -> None:
-        """Play one hour in every row with a target for each crew, int64 (B, C), as in section 6.2.4.
+        """Play one hour in every row with an action for each crew, int64 (B, C), as in section 6.2.4.
 
-        Targets of busy crews are ignored. Afterwards `acting` is -1 in rows whose crews are all busy.
+        Actions of busy crews are ignored. Afterwards `acting` is -1 in rows whose crews are all busy.
         """
         dynamics.play_hour(self.state, self.rules, self._checked(choices, (self.batch, self.max_agents)))
 
-    def _checked(self, targets: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-        targets = np.asarray(targets, np.int64)
-        if targets.shape != shape:
-            raise IllegalActionError(f"targets: expected shape {shape}, got {targets.shape}")
-        outside = dynamics.first_outside(targets.ravel(), self.max_targets)
+    def _checked(self, actions: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+        actions = np.asarray(actions, np.int64)
+        if actions.shape != shape:
+            raise IllegalActionError(f"actions: expected shape {shape}, got {actions.shape}")
+        outside = dynamics.first_outside(actions.ravel(), self.max_actions)
         if outside >= 0:
-            bad = targets.ravel()[outside]
-            raise IllegalActionError(f"target {bad}: expected a plane's slot in [0, {self.max_targets - 1}]")
-        return targets
+            bad = actions.ravel()[outside]
+            raise IllegalActionError(f"target {bad}: expected a plane's slot in [0, {self.max_actions - 1}]")
+        return actions
 
     def observe(self, agents: np.ndarray, out: Observation | None = None) -> Observation:
         """The graph each row's crew sees under the simulator's view; see TurnSimulator.observe."""
@@ -234,6 +234,6 @@ def _new_state(batch: int, planes: int, crews: int, horizon: int, staleness: int
         series=np.zeros((batch, horizon, 3)),
         timeline=np.zeros((batch, horizon, slots) if timeline else (0, 0, 0), np.uint8),
         past=np.zeros((batch, staleness + 1 if staleness else 0, slots), dynamics.PLANE),
-        told=np.zeros(memory, dynamics.PLANE),
-        told_at=np.full(memory, -1, np.int64),
+        private_memory=np.zeros(memory, dynamics.PLANE),
+        private_memory_at=np.full(memory, -1, np.int64),
     )

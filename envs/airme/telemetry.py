@@ -1,4 +1,4 @@
-"""AirME on the wire: what the world says hour by hour, and the belief a deployed crew builds from what it may hear.
+"""AirME on the wire: what the world says hour by hour, and the local state a crew builds from what it may hear.
 
 Channels, each with the newest state as its payload (msgpack):
 
@@ -6,9 +6,9 @@ Channels, each with the newest state as its payload (msgpack):
                              (and, where the view has no staleness, for all crews within reach)
     plane/<sector>/delayed   the same, as they were `staleness` hours ago, for the other crews within reach
     crew/<id>/status         the crew's job and its choice of this hour, for all crews within comm
-    crew/<id>/told           what that crew alone learnt of planes: from a conflict, or from a repair of its own
+    crew/<id>/memory           what that crew alone learnt of planes: from a conflict, or from a repair of its own
 
-A belief is a simulator state of one row that is filled in only where the crew heard something and is zero
+A local state is a simulator state of one row that is filled in only where the crew heard something and is zero
 elsewhere. It is read by the kernel that observes the true state, so that what a deployed crew sees is equal to
 the simulator's observation to the last bit.
 """
@@ -34,7 +34,7 @@ Hour = Annotated[int, msgspec.Meta(ge=0, lt=2**40)]
 
 NOBODY, CHOSEN, REPAIRED = 0, 1, 2  # who has a plane in hand: nobody, a crew that chose it this hour, a repairer
 _SECTOR = re.compile(r"plane/(\d+)/(now|delayed)")
-_CREW_CHANNEL = re.compile(r"crew/(\d+)/(status|told)")
+_CREW_CHANNEL = re.compile(r"crew/(\d+)/(status|memory)")
 
 
 class _Payload(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="type"):
@@ -82,7 +82,7 @@ class Sector(_Payload, tag="airme.sector.1", frozen=True):
 
 
 class CrewStatus(_Payload, tag="airme.crew.1", frozen=True):
-    """A crew at a moment of `hour`; see dynamics.CREW."""
+    """A crew at a decision epoch of `hour`; see dynamics.CREW."""
 
     hour: Hour
     plane: Count
@@ -91,17 +91,17 @@ class CrewStatus(_Payload, tag="airme.crew.1", frozen=True):
     choice: Annotated[int, msgspec.Meta(ge=-1, lt=2**31)]
 
 
-class Told(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+class KnownPlane(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
     """A plane as a crew learnt it to be at `hour`."""
 
     hour: Hour
     plane: PlaneStatus
 
 
-class Memory(_Payload, tag="airme.told.1", frozen=True):
-    """All that a crew learnt by itself and that is not older than the pictures of other sectors."""
+class Memory(_Payload, tag="airme.memory.1", frozen=True):
+    """All that a crew learnt by itself and that is not older than the delayed snapshots of other sectors."""
 
-    planes: list[Told]
+    planes: list[KnownPlane]
 
 
 P = TypeVar("P", bound=_Payload)
@@ -142,7 +142,7 @@ def _sector_slots(sector: int, n_planes: int, n_crews: int) -> range:
 class AirmeTelemetry:
     """The world's side, and the way to an agent's; see marl_sched.domain.Telemetry."""
 
-    moment = "hour"
+    time_unit = "hour"
 
     def frame(self, simulator: AirmeSimulator) -> bytes:
         """Sizes, padding, usage and view of row 0."""
@@ -152,7 +152,7 @@ class AirmeTelemetry:
             Frame(
                 n_planes=int(row["n_planes"]),
                 n_crews=int(row["n_crews"]),
-                max_planes=simulator.max_targets - 1,
+                max_planes=simulator.max_actions - 1,
                 max_crews=simulator.max_agents,
                 usage=simulator.rules.usage.tolist(),
                 reach=reach,
@@ -166,20 +166,20 @@ class AirmeTelemetry:
         state, staleness = simulator.state, int(simulator.limits[0, 2])
         n_planes, n_crews = int(state.rows[0]["n_planes"]), int(state.rows[0]["n_crews"])
         now = int(state.rows[0]["time"])
-        pictured = max(0, now - staleness)
+        snapshot_hour = max(0, now - staleness)
         said: dict[str, bytes] = {}
         for sector in range(n_crews):
             slots = _sector_slots(sector, n_planes, n_crews)
             planes = _statuses(state.planes[0], slots, with_chosen=False)
             said[f"plane/{sector}/now"] = _encode(Sector(hour=now, planes=planes))
             if staleness:
-                planes = _statuses(state.past[0, pictured % state.past.shape[1]], slots, with_chosen=False)
-                said[f"plane/{sector}/delayed"] = _encode(Sector(hour=pictured, planes=planes))
+                planes = _statuses(state.past[0, snapshot_hour % state.past.shape[1]], slots, with_chosen=False)
+                said[f"plane/{sector}/delayed"] = _encode(Sector(hour=snapshot_hour, planes=planes))
         for crew in range(n_crews):
             record = {name: int(state.crews[0, crew][name]) for name in CREW.names or ()}
             said[f"crew/{crew}/status"] = _encode(CrewStatus(hour=now, **record))
             if staleness:
-                said[f"crew/{crew}/told"] = _encode(_memory(state, crew, pictured))
+                said[f"crew/{crew}/memory"] = _encode(_memory(state, crew, snapshot_hour))
         return said
 
     def series(self, simulator: AirmeSimulator) -> dict[str, list[float]]:
@@ -187,20 +187,20 @@ class AirmeTelemetry:
         hours = int(simulator.time[0])
         return {name: simulator.state.series[0, :hours, k].tolist() for k, name in enumerate(OBJECTIVES)}
 
-    def belief(self, frame: bytes, agent: int) -> AirmeBelief:
-        """A crew's empty belief."""
-        return AirmeBelief(_decode(frame, Frame), agent)
+    def local_state(self, frame: bytes, agent: int) -> AirmeLocalState:
+        """A crew's empty local state."""
+        return AirmeLocalState(_decode(frame, Frame), agent)
 
 
-def _memory(state: State, crew: int, pictured: int) -> Memory:
-    kept = [int(slot) for slot in np.flatnonzero(state.told_at[0, crew] >= pictured)]
-    hours = state.told_at[0, crew, kept].tolist()
-    planes = [_statuses(state.told[0, crew], range(slot, slot + 1), with_chosen=True)[0] for slot in kept]
-    return Memory(planes=[Told(hour, plane) for hour, plane in zip(hours, planes, strict=True)])
+def _memory(state: State, crew: int, snapshot_hour: int) -> Memory:
+    kept = [int(slot) for slot in np.flatnonzero(state.private_memory_at[0, crew] >= snapshot_hour)]
+    hours = state.private_memory_at[0, crew, kept].tolist()
+    planes = [_statuses(state.private_memory[0, crew], range(slot, slot + 1), with_chosen=True)[0] for slot in kept]
+    return Memory(planes=[KnownPlane(hour, plane) for hour, plane in zip(hours, planes, strict=True)])
 
 
-class AirmeBelief:
-    """What one crew knows; see marl_sched.domain.Belief."""
+class AirmeLocalState:
+    """What one crew knows; see marl_sched.domain.LocalState."""
 
     def __init__(self, frame: Frame, agent: int) -> None:
         if not 0 <= agent < frame.n_crews:
@@ -217,7 +217,7 @@ class AirmeBelief:
         self._crews = [c for c in range(frame.n_crews) if ring_distance(agent, c, frame.n_crews) <= frame.comm]
         channels = [f"plane/{sector}/{age}" for sector, age in self._sectors.items()]
         channels += [f"crew/{crew}/status" for crew in self._crews]
-        channels += [f"crew/{agent}/told"] if frame.staleness else []
+        channels += [f"crew/{agent}/memory"] if frame.staleness else []
         self.channels = tuple(sorted(channels))
         self._limits = np.array([[frame.reach, frame.comm, frame.staleness]])
         self._state = _empty_state(frame)
@@ -226,7 +226,7 @@ class AirmeBelief:
         self._observation: Observation = {name: spec.empty(1) for name, spec in arrays.items()}
 
     def hear(self, channel: str, payload: bytes) -> None:
-        """Take in a channel's newest payload; see Belief.hear."""
+        """Take in a channel's newest payload; see LocalState.hear."""
         if channel not in self.channels:
             raise InvalidMessageError(f"{channel}: not a channel that crew {self._agent} hears")
         if match := _SECTOR.fullmatch(channel):
@@ -254,11 +254,11 @@ class AirmeBelief:
         for name in CREW.names or ():
             record[name] = getattr(said, name)
         if crew == self._agent:
-            self._state.rows["time"] = said.hour  # its own clock: the moment at which the crew decides
+            self._state.rows["time"] = said.hour  # its own clock: the hour in which the crew decides
 
     def _hear_memory(self, said: Memory) -> None:
         self._check([told.plane for told in said.planes])
-        told, told_at = self._state.told[0, self._agent], self._state.told_at[0, self._agent]
+        told, told_at = self._state.private_memory[0, self._agent], self._state.private_memory_at[0, self._agent]
         told_at[:] = -1
         for item in said.planes:
             _restore(told, item.plane)
@@ -291,10 +291,10 @@ def _empty_state(frame: Frame) -> State:
         series=np.zeros((1, 0, len(OBJECTIVES))),
         timeline=np.zeros((0, 0, 0), np.uint8),
         past=np.zeros((1, frame.staleness + 1 if frame.staleness else 0, slots), PLANE),
-        told=np.zeros(memory, PLANE),
-        told_at=np.full(memory, -1, np.int64),
+        private_memory=np.zeros(memory, PLANE),
+        private_memory_at=np.full(memory, -1, np.int64),
     )
-    for planes in (state.planes, state.past, state.told):
+    for planes in (state.planes, state.past, state.private_memory):
         for name, value in unknown.items():
             planes[name] = value
     return state

@@ -15,10 +15,10 @@ from numba import njit
 
 from marl_sched.envs.airme.dynamics import Stream
 from marl_sched.errors import InvalidOptionError, require_integer
-from marl_sched.noise import integer, moment_key, uniform
+from marl_sched.noise import integer, time_key, uniform
 
 EVERYWHERE = 1 << 30
-MOST_STALENESS = 8760  # hours: a year, of which a simulator keeps a picture an hour
+MOST_STALENESS = 8760  # hours: a year, of which a simulator keeps one snapshot an hour
 
 Limits = tuple[int, int, int]  # reach, comm, staleness
 
@@ -40,7 +40,7 @@ class FullView:
 
     @property
     def memory(self) -> int:
-        """How many hours back a picture may be asked for."""
+        """How many hours back a delayed snapshot may be asked for."""
         return 0
 
 
@@ -49,8 +49,8 @@ class LocalView:
     """A crew sees sectors within ring distance `reach` and crews within `comm`.
 
     Its own sector it sees as it is; another one as it was `staleness` hours ago. Of a crew within `comm` it
-    knows the present job and, if that crew has already acted this hour, its choice. What a conflict told it
-    of a plane, and how it left a plane that it repaired itself, it keeps until the sector's picture is newer.
+    knows the present job and, if that crew has already acted this hour, its choice. What it learned from a conflict
+    of a plane, and how it left a plane that it repaired itself, it keeps until the sector's delayed snapshot is newer.
     Raises InvalidOptionError for an option that is not an integer, negative or too large.
     """
 
@@ -76,7 +76,7 @@ class LocalView:
 
     @property
     def memory(self) -> int:
-        """How many hours back a picture may be asked for."""
+        """How many hours back a delayed snapshot may be asked for."""
         return self.staleness
 
 
@@ -110,8 +110,8 @@ class RandomView:
 
     def limits_in(self, episode: np.uint64) -> Limits:
         """Those of the episode with that key of its noise."""
-        moment = np.uint64(moment_key(episode, 0))
-        reach, comm, fresh, staleness = (uniform(moment, int(Stream.VIEW), which, 0) for which in range(4))
+        time_word = np.uint64(time_key(episode, 0))
+        reach, comm, fresh, staleness = (uniform(time_word, int(Stream.VIEW), which, 0) for which in range(4))
         return (
             integer(reach, 0, self.reach_most),
             integer(comm, 0, self.comm_most),
@@ -120,7 +120,7 @@ class RandomView:
 
     @property
     def memory(self) -> int:
-        """How many hours back a picture may be asked for."""
+        """How many hours back a delayed snapshot may be asked for."""
         return self.staleness_most
 
 

@@ -22,7 +22,7 @@ class RoundSchedules:
 
     def action_space(self, simulator: MurseSimulator) -> spaces.MultiDiscrete:
         """`MultiDiscrete([[N + 1, A]] * N)`, padded like the simulator."""
-        n_tasks = simulator.max_targets - 2
+        n_tasks = simulator.max_actions - 2
         return spaces.MultiDiscrete(np.tile([n_tasks + 1, simulator.max_agents], (n_tasks, 1)))
 
     def play(self, simulator: MurseSimulator, action: Any) -> tuple[float, dict[str, Any]]:

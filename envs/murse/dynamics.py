@@ -21,10 +21,10 @@ from numba import njit
 from marl_sched.envs.murse.estimator import predict, update
 from marl_sched.envs.murse.learning import drawn_duration, mean_duration, whole
 from marl_sched.envs.murse.rules import DECISION_REWARD, FIRST, LEAST_LEFT, MEAN_ALL, ONLINE, Rules
-from marl_sched.envs.murse.scoring import cost_so_far, judge, loss
+from marl_sched.envs.murse.scoring import cost_so_far, evaluate_round, round_cost
 from marl_sched.envs.murse.state import NEVER, NOBODY, NOT_WAITING, NOTHING, State
 from marl_sched.envs.murse.timetable import earliest_start, longest_round, time_order, waits_heeded
-from marl_sched.noise import moment_key
+from marl_sched.noise import time_key
 
 Record = Any  # one element of a record array, whose fields compiled code reads as attributes
 
@@ -68,7 +68,7 @@ def begin_round(state: State, rules: Rules, b: int) -> None:
     agents.free_at[:] = 0
     agents.waiting_since[:] = NOT_WAITING
     agents.last_task[:] = NOTHING
-    state.told[b] = -1
+    state.private_memory[b] = -1
     draw_durations(state, b)
     n, m = row.n_tasks, row.n_agents
     pairs = state.pairs[b, :n, :m]
@@ -80,7 +80,7 @@ def begin_round(state: State, rules: Rules, b: int) -> None:
 def draw_durations(state: State, b: int) -> None:
     """True durations of this round, one draw per task and human, and what the team expects of them."""
     row = state.rows[b]
-    moment = moment_key(row.episode, row.round)
+    time_word = time_key(row.episode, row.round)
     for task in range(row.n_tasks):
         for agent in range(row.n_agents):
             pair, base = state.pairs[b, task, agent], state.base[b, task, agent]
@@ -90,7 +90,7 @@ def draw_durations(state: State, b: int) -> None:
                 curve = state.curves[b, task, agent]
                 if row.stochastic:
                     entity = task * MAX_HUMANS + agent - row.n_robots
-                    drawn = drawn_duration(curve, pair.repetitions, row.learning, moment, entity)
+                    drawn = drawn_duration(curve, pair.repetitions, row.learning, time_word, entity)
                     expected, pair.spread = predict(state.filters[b, task, agent], pair.repetitions, row.learning)
                     pair.true = whole(drawn, row.low, row.high)
                     pair.planned = whole(expected, row.low, row.high)
@@ -109,14 +109,14 @@ def pick_agent(state: State, rules: Rules, b: int) -> int:
     longest round.
     """
     row, agents = state.rows[b], state.agents[b]
-    moment = agents.free_at[: row.n_agents].min()
-    if moment >= NEVER or moment > row.limit:
+    earliest = agents.free_at[: row.n_agents].min()
+    if earliest >= NEVER or earliest > row.limit:
         return NOBODY
-    row.clock = moment
-    row.time = row.origin + moment
+    row.clock = earliest
+    row.time = row.origin + earliest
     best, least = NOBODY, np.inf
     for agent in range(row.n_agents):
-        if agents[agent].free_at == moment:
+        if agents[agent].free_at == earliest:
             key = preference(state, rules.picking, b, agent)
             if best == NOBODY or key < least:
                 best, least = agent, key
@@ -190,29 +190,29 @@ def wait(state: State, b: int, agent: int) -> None:
 
 
 @njit(cache=True)
-def decide(state: State, rules: Rules, b: int, target: int) -> None:
-    """The acting agent waits, commits to task `target - 1`, or idles a unit because that is impossible in truth."""
+def decide(state: State, rules: Rules, b: int, action: int) -> None:
+    """The acting agent waits, commits to task `action - 1`, or idles a unit because that is impossible in truth."""
     row, agent = state.rows[b], state.rows[b].acting
     state.agents[b, agent].waiting_since = NOT_WAITING
-    if target == WAIT:
+    if action == WAIT:
         wait(state, b, agent)
-    elif dispatchable(state, b, target - 1, agent):
+    elif dispatchable(state, b, action - 1, agent):
         before = cost_so_far(state, rules, b)
-        dispatch(state, rules, b, target - 1, agent)
+        dispatch(state, rules, b, action - 1, agent)
         if rules.rewards == DECISION_REWARD and row.dispatched < row.n_tasks:
             row.reward = (before - cost_so_far(state, rules, b)) / rules.divisor
     else:
         row.conflict = True
         row.conflicts += 1
         state.agents[b, agent].free_at = row.clock + IDLE_AFTER_CONFLICT
-        if target <= row.n_tasks and state.tasks[b, target - 1].agent != NOBODY:
-            tell(state, rules, b, target - 1, agent)
+        if action <= row.n_tasks and state.tasks[b, action - 1].agent != NOBODY:
+            tell(state, rules, b, action - 1, agent)
 
 
 @njit(cache=True)
 def tell(state: State, rules: Rules, b: int, task: int, agent: int) -> None:
     """An agent that came to a taken task learns when it starts and ends, as far as its worker can tell now."""
-    job, now, told = state.tasks[b, task], state.rows[b].clock, state.told[b, agent, task]
+    job, now, told = state.tasks[b, task], state.rows[b].clock, state.private_memory[b, agent, task]
     told[0], told[1] = job.start, job.finish
     if rules.mode == ONLINE and job.finish > now:
         told[0] = min(job.start, now)
@@ -248,15 +248,15 @@ def learn(state: State, b: int) -> None:
 
 @njit(cache=True)
 def end_round(state: State, rules: Rules, b: int) -> None:
-    """Execute, judge and pay the round, then begin the next one or end the episode."""
+    """Execute, evaluate and pay the round, then begin the next one or end the episode."""
     row = state.rows[b]
     planned = state.tasks[b].finish.max()
     consistent = rules.mode == ONLINE or execute_plan(state, b)
-    judge(state, b, consistent)
+    evaluate_round(state, b, consistent)
     result, spent = state.rounds[b, row.round], -row.paid
     if rules.rewards == DECISION_REWARD and result.feasible:
         spent *= rules.divisor  # section 3.4.1 divides all changes but the last
-    row.reward -= loss(state, rules, b) - spent
+    row.reward -= round_cost(state, rules, b) - spent
     learn(state, b)
     # Time never runs backwards: a plan may have looked further ahead than its execution took.
     row.origin += max(result.makespan, planned, row.clock + 1)
@@ -270,9 +270,9 @@ def end_round(state: State, rules: Rules, b: int) -> None:
 
 
 @njit(cache=True)
-def step(state: State, rules: Rules, targets: np.ndarray) -> None:
+def step(state: State, rules: Rules, actions: np.ndarray) -> None:
     """Take a turn, int64 (B,), in every row that is not over, and go on to its next acting agent."""
-    for b in range(len(targets)):
+    for b in range(len(actions)):
         row = state.rows[b]
         row.reward = 0.0
         row.conflict = False
@@ -280,7 +280,7 @@ def step(state: State, rules: Rules, targets: np.ndarray) -> None:
         if row.acting == NOBODY:
             continue
         before = row.time
-        decide(state, rules, b, targets[b])
+        decide(state, rules, b, actions[b])
         row.paid += row.reward
         row.acting = NOBODY if row.dispatched == row.n_tasks else pick_agent(state, rules, b)
         if row.acting == NOBODY:

@@ -1,6 +1,6 @@
 """A MuRSE problem: tasks for a team of robots and humans (dissertation, sections 3.2, 4.2.1 and 5.2.1).
 
-Arrays count tasks, agents and waits from 0; files, messages and targets count tasks from 1. Robots come
+Arrays count tasks, agents and waits from 0; files, messages and actions count tasks from 1. Robots come
 before humans. A pair of task and agent is ineligible when the agent's duration for the task is 0.
 """
 

@@ -53,22 +53,22 @@ def mean_duration(curve: np.ndarray, repetitions: int, learning: int) -> float:
 
 
 @njit(cache=True)
-def normal_pair(moment: np.uint64, entity: int, draw: int) -> tuple[float, float]:
+def normal_pair(time_word: np.uint64, entity: int, draw: int) -> tuple[float, float]:
     """Two standard normals from draws `draw` and `draw + 1` (Box and Muller, 1958)."""
-    radius = np.sqrt(-2.0 * np.log(1.0 - uniform(moment, MurseStream.DURATION, entity, draw)))
-    angle = 2.0 * np.pi * uniform(moment, MurseStream.DURATION, entity, draw + 1)
+    radius = np.sqrt(-2.0 * np.log(1.0 - uniform(time_word, MurseStream.DURATION, entity, draw)))
+    angle = 2.0 * np.pi * uniform(time_word, MurseStream.DURATION, entity, draw + 1)
     return radius * np.cos(angle), radius * np.sin(angle)
 
 
 @njit(cache=True)
-def drawn_duration(curve: np.ndarray, repetitions: int, learning: int, moment: np.uint64, entity: int) -> float:
+def drawn_duration(curve: np.ndarray, repetitions: int, learning: int, time_word: np.uint64, entity: int) -> float:
     """One execution's duration of a stochastic human, before rounding and clipping.
 
     c, k and beta are normal about their means; a negative beta, 0.15 percent of the draws, counts as 0.
-    `moment` is the noise of this round, `entity` names the pair of task and human.
+    `time_word` is the noise of this round, `entity` names the pair of task and human.
     """
-    first, second = normal_pair(moment, entity, 0)
-    third, _ = normal_pair(moment, entity, 2)
+    first, second = normal_pair(time_word, entity, 0)
+    third, _ = normal_pair(time_word, entity, 2)
     beta = max(curve[BETA] + curve[BETA_STD] * third, 0.0)
     c, k = curve[C] + curve[C_STD] * first, curve[K] + curve[K_STD] * second
     return c + k * remaining_share(beta, repetitions, learning)

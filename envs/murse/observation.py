@@ -60,7 +60,7 @@ def observe(state: State, rules: Rules, agents: np.ndarray, sensing: float, comm
         see_network(state, b, sight, out)
         summarise(state, b, sight, out)
         if state.agents[b, viewer].free_at <= state.rows[b].clock and state.rows[b].acting != NOBODY:
-            offer(state, b, sight, out)
+            write_action_mask(state, b, sight, out)
 
 
 @njit(cache=True, error_model="numpy")
@@ -314,8 +314,8 @@ def visible_bounds(
 
 
 @njit(cache=True, error_model="numpy")
-def offer(state: State, b: int, sight: Sight, out: Arrays) -> None:
-    """The targets that are legal as far as the viewer knows: free, eligible, and behind all that they wait for."""
+def write_action_mask(state: State, b: int, sight: Sight, out: Arrays) -> None:
+    """The actions that are legal as far as the viewer knows: free, eligible, and behind all that they wait for."""
     for slot in range(1, state.rows[b].n_tasks + 1):
         features = out.task[b, slot]
         free = features[UNSCHEDULED] == 1.0 and features[ELIGIBLE] == 1.0

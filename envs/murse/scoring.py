@@ -29,7 +29,7 @@ def total_weight(state: State, rules: Rules, b: int) -> float:
 
 
 @njit(cache=True)
-def judge(state: State, b: int, consistent: bool) -> None:
+def evaluate_round(state: State, b: int, consistent: bool) -> None:
     """Note in `rounds` and `executed` how the round went, on true times; an inconsistent one is infeasible."""
     row, tasks = state.rows[b], state.tasks[b]
     n, m, result = row.n_tasks, row.n_agents, state.rounds[b, row.round]
@@ -81,7 +81,7 @@ def published_loss(state: State, rules: Rules, b: int) -> float:
 
 
 @njit(cache=True)
-def loss(state: State, rules: Rules, b: int) -> float:
+def round_cost(state: State, rules: Rules, b: int) -> float:
     """What a judged round costs in training.
 
     An infeasible round costs, at whatever step it failed, at least as much as the longest feasible one.

@@ -102,7 +102,7 @@ class MurseSimulator(TurnSimulator):
             tasks, agents = scale.tasks[1], scale.agents[1]
         else:
             tasks, agents = max(i.n_tasks for i in self.instances), max(i.n_agents for i in self.instances)
-        self._max_tasks, self.max_targets, self.max_agents = tasks, tasks + 2, agents
+        self._max_tasks, self.max_actions, self.max_agents = tasks, tasks + 2, agents
         self.state = new_state(self.batch, tasks, agents, self.horizon)
         self.graph = graph.graph_spec(simplification)
         sizes = {"task": tasks + 2, "agent": agents, "location": tasks, "decision": tasks + 2}
@@ -157,15 +157,15 @@ class MurseSimulator(TurnSimulator):
         key = episode_key(np.uint64(self._seeds[b]), np.uint64(instance.identity), np.uint64(self._episodes[b]))
         self.state.rows["episode"][b] = np.uint64(key)
 
-    def step(self, targets: np.ndarray) -> None:
+    def step(self, actions: np.ndarray) -> None:
         """Take one turn in every row; see TurnSimulator.step."""
-        targets = np.asarray(targets, np.int64)
-        if targets.shape != (self.batch,):
-            raise IllegalActionError(f"targets: expected shape {(self.batch,)}, got {targets.shape}")
-        if targets.min() < 0 or targets.max() >= self.max_targets:
-            bad = int(targets.min()) if targets.min() < 0 else int(targets.max())
-            raise IllegalActionError(f"target {bad}: expected a task's slot in [0, {self.max_targets - 1}]")
-        dynamics.step(self.state, self.rules, targets)
+        actions = np.asarray(actions, np.int64)
+        if actions.shape != (self.batch,):
+            raise IllegalActionError(f"actions: expected shape {(self.batch,)}, got {actions.shape}")
+        if actions.min() < 0 or actions.max() >= self.max_actions:
+            bad = int(actions.min()) if actions.min() < 0 else int(actions.max())
+            raise IllegalActionError(f"target {bad}: expected a task's slot in [0, {self.max_actions - 1}]")
+        dynamics.step(self.state, self.rules, actions)
 
     def play_round(self, row: int, tasks: np.ndarray, agents: np.ndarray) -> None:
         """Execute a whole schedule as this round's plan in one row, whatever was dispatched so far.
@@ -187,7 +187,7 @@ class MurseSimulator(TurnSimulator):
         dynamics.play_round(self.state, self.rules, row, tasks, agents)
 
     def dispatchable(self, row: int, task: int, agent: int) -> bool:
-        """Whether an agent could in truth commit to a task, counted from 0, at this moment."""
+        """Whether an agent could in truth commit to a task, counted from 0, at this decision epoch."""
         return bool(dynamics.dispatchable(self.state, row, task, agent))
 
     def observe(self, agents: np.ndarray, out: Observation | None = None) -> Observation:
@@ -206,7 +206,7 @@ class MurseSimulator(TurnSimulator):
         return out
 
     def free_agents(self, row: int) -> np.ndarray:
-        """Agents that have still to act at this moment, in turn order as things stand."""
+        """Agents that have still to act at this decision epoch, in turn order as things stand."""
         if self.over[row]:
             return np.empty(0, np.int64)
         free_at = self.state.agents["free_at"][row, : self.n_agents[row]]
@@ -248,7 +248,7 @@ class MurseSimulator(TurnSimulator):
 
     def snapshot(self, row: int) -> dict[str, np.ndarray]:
         """Copies of a row's state, without its instance's constants."""
-        names = ("rows", "tasks", "agents", "pairs", "filters", "order", "told", "rounds", "executed")
+        names = ("rows", "tasks", "agents", "pairs", "filters", "order", "private_memory", "rounds", "executed")
         return {name: getattr(self.state, name)[row].copy() for name in names}
 
 

@@ -1,6 +1,6 @@
 """The arrays of a batch of MuRSE episodes: B rows, N task slots, A agent slots, R rounds.
 
-Tasks and agents count from 0 here; target i + 1 is task i. All times are whole units from the round's start,
+Tasks and agents count from 0 here; action i + 1 is task i. All times are whole units from the round's start,
 except a row's `time`, which runs on over the rounds.
 """
 
@@ -116,7 +116,9 @@ class State(NamedTuple):
     lags: np.ndarray  # int64 (B, N, N), as MurseInstance.lags
     near: np.ndarray  # bool (B, N, N), as MurseInstance.near
     order: np.ndarray  # int64 (B, N), tasks in dispatch order, the first `dispatched` of them hold
-    told: np.ndarray  # int64 (B, A, N, 2), start and finish of a taken task as a conflict told an agent, -1: not told
+    private_memory: (
+        np.ndarray
+    )  # int64 (B, A, N, 2), start and finish of a taken task that an agent learned from a conflict, -1: not learned
     rounds: np.ndarray  # ROUND (B, R)
     executed: np.ndarray  # EXECUTED (B, R, N)
 
@@ -135,7 +137,7 @@ def new_state(batch: int, n_tasks: int, n_agents: int, n_rounds: int) -> State:
         lags=np.full((batch, n_tasks, n_tasks), -1, np.int64),
         near=np.zeros((batch, n_tasks, n_tasks), np.bool_),
         order=np.zeros((batch, n_tasks), np.int64),
-        told=np.full((batch, n_agents, n_tasks, 2), -1, np.int64),
+        private_memory=np.full((batch, n_agents, n_tasks, 2), -1, np.int64),
         rounds=np.zeros((batch, n_rounds), ROUND),
         executed=np.zeros((batch, n_rounds, n_tasks), EXECUTED),
     )

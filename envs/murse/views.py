@@ -61,7 +61,7 @@ VIEWS: dict[str, type] = {"full": FullView, "local": LocalView}
 
 
 class Sight(NamedTuple):
-    """What one agent knows at one moment."""
+    """What one agent knows at one decision epoch."""
 
     heard: np.ndarray  # bool (A,), agents within hearing
     seen: np.ndarray  # bool (N,), tasks in sight
@@ -117,7 +117,7 @@ def knows(state: State, b: int, viewer: int, heard: np.ndarray, known: np.ndarra
     """Of which tasks the viewer knows that they are taken: writes bool (N,)."""
     for task in range(state.rows[b].n_tasks):
         agent = state.tasks[b, task].agent
-        known[task] = agent != NOBODY and (heard[agent] or state.told[b, viewer, task, 1] >= 0)
+        known[task] = agent != NOBODY and (heard[agent] or state.private_memory[b, viewer, task, 1] >= 0)
 
 
 @njit(cache=True)
@@ -135,8 +135,8 @@ def believes(
 
     A plan's times are common knowledge. In `online` mode a finished task's times are the truth; of a running one
     the start, to which its planned duration is added (it takes at least until the next unit); one that has not
-    started follows from the beliefs about what it waits for, in order of commitment. What a conflict told stays as
-    it was told.
+    started follows from the beliefs about what it waits for, in order of commitment. What was
+    learned from a conflict stays as it was learned.
     """
     row, tasks = state.rows[b], state.tasks[b]
     for k in range(row.dispatched):
@@ -145,7 +145,7 @@ def believes(
             continue
         job = tasks[task]
         if not heard[job.agent]:
-            start[task], finish[task] = state.told[b, viewer, task]
+            start[task], finish[task] = state.private_memory[b, viewer, task]
             continue
         start[task], finish[task] = job.start, job.finish
         if rules.mode != ONLINE or job.finish <= row.clock:

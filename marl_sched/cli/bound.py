@@ -79,7 +79,7 @@ def _prove(env: str, problems: list[Any], price_vectors: int, **settings: Any) -
     """The relaxation of a domain's problems and the bound of each, float64 (B,); a spinner tells how far it is."""
     from rich.console import Console
 
-    package = f"marl_sched.agents.{env}_bound"
+    package = f"marl_sched.agents.{env}.bound"
     if find_spec(package) is None:
         raise InvalidOptionError(f"--env: no bound is known for the environment {env!r}")
     bounds = import_module(f"{package}.relaxation")

@@ -38,7 +38,7 @@ def demo(
     from marl_sched.cli.tables import print_scores
     from marl_sched.domain import get_domain
     from marl_sched.files import write_json
-    from marl_sched.train.compare import draw_scores, draw_timelines
+    from marl_sched.train.evaluation.compare import draw_scores, draw_timelines
 
     options.check_folder(out)
     domain = get_domain(ENV)
@@ -111,8 +111,8 @@ def _require_equal(deployed: list[float], domain: Domain, replay: TurnSimulator)
 
 def _same_month(domain: Domain, policy: str, view: Any) -> dict[str, TurnSimulator]:
     """The deployed episode in one process: by the policy, then by rules that see and decide everything."""
-    from marl_sched.train.compare import play_episode
-    from marl_sched.train.evaluate import Settings
+    from marl_sched.train.evaluation.compare import play_episode
+    from marl_sched.train.evaluation.evaluate import Settings
 
     instance = domain.instances(SCALE, 1, SEED)[0]
     together = Settings(objective=OBJECTIVE, horizon=HOURS, scale=SCALE, seed=SEED)
@@ -127,7 +127,7 @@ def _same_month(domain: Domain, policy: str, view: Any) -> dict[str, TurnSimulat
 
 def _compare(domain: Domain, names: list[str], view: Any) -> dict[str, Any]:
     from marl_sched.cli.evaluation import play
-    from marl_sched.train.evaluate import Settings
+    from marl_sched.train.evaluation.evaluate import Settings
 
     instances = domain.instances(SCALE, INSTANCES, COMPARISON_SEED)
     settings = Settings(episodes=EPISODES, seed=COMPARISON_SEED, view=view, objective=OBJECTIVE, scale=SCALE)

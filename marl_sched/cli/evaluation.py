@@ -49,7 +49,7 @@ def compare(
     """As evaluate, and draw the scores, an episode of every scheduler and the learning curves of training logs."""
     from marl_sched.cli.tables import print_scores
     from marl_sched.files import write_json
-    from marl_sched.train.compare import draw_learning_curves, draw_scores, draw_timelines, play_episode
+    from marl_sched.train.evaluation.compare import draw_learning_curves, draw_scores, draw_timelines, play_episode
 
     options.check_folder(out)
     options.check_output(json)
@@ -77,8 +77,8 @@ def play(resolved: Resolved, baseline: str | None) -> dict[str, Any]:
     from rich.progress import Progress
 
     from marl_sched.agents.registry import create_scheduler
-    from marl_sched.train.allocation import keep_freed_memory
-    from marl_sched.train.evaluate import evaluate
+    from marl_sched.train.evaluation.evaluate import evaluate
+    from marl_sched.train.malloc import keep_freed_memory
 
     keep_freed_memory()
     domain = resolved.domain
@@ -108,7 +108,7 @@ def bench(
     json: options.JsonFile = None,
     repeats: Annotated[int, typer.Option("--repeats", min=1, help="Measurements; the best is reported.")] = 5,
 ) -> None:
-    """Measure how fast the simulator, its faces and the policy are on this machine, on one thread."""
+    """Measure how fast the simulator, its environment APIs and the policy are on this machine, on one thread."""
     from marl_sched.cli.tables import print_bench
     from marl_sched.domain import get_domain
     from marl_sched.files import write_json

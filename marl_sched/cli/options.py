@@ -12,7 +12,7 @@ import typer
 from marl_sched.errors import InvalidFileError, InvalidOptionError
 
 if TYPE_CHECKING:
-    from marl_sched.agents.cards import PolicyCard
+    from marl_sched.agents.policies.cards import PolicyCard
     from marl_sched.domain import Domain
 
 Env = Annotated[str, typer.Option("--env", help="The environment; `marl-sched list` shows all.")]
@@ -87,7 +87,7 @@ def tell_of_training(name: str, card: PolicyCard | None, view: Any, objective: s
     """
     if card is None:
         return
-    from marl_sched.train.evaluate import view_as_json
+    from marl_sched.train.evaluation.evaluate import view_as_json
 
     trained, now = card.view, view_as_json(view)
     if trained != now and trained["kind"] != "random":

@@ -11,8 +11,8 @@ from marl_sched.cli import options
 from marl_sched.errors import InvalidOptionError
 
 if TYPE_CHECKING:
-    from marl_sched.train.tables.cells import Cells, Job
-    from marl_sched.train.tables.entries import Untrained
+    from marl_sched.train.published.cells import Cells, Job
+    from marl_sched.train.published.entries import Untrained
 
 FOLDER, QUICK_FOLDER = Path("docs/results"), Path("out/tables")
 UNTRAINED = 3  # exit code when the page is made, but lacks policies
@@ -41,11 +41,11 @@ def tables(
     Run it at the root of a checkout. It can be stopped and started again; finished cells are kept. Ends with 3 if
     policies of the list are not trained yet; the page names them.
     """
-    from marl_sched.train.tables.cells import Cells
-    from marl_sched.train.tables.entries import Entries
-    from marl_sched.train.tables.filling import missing
-    from marl_sched.train.tables.page import write_pages
-    from marl_sched.train.tables.plan import load_plan
+    from marl_sched.train.published.cells import Cells
+    from marl_sched.train.published.entries import Entries
+    from marl_sched.train.published.filling import missing
+    from marl_sched.train.published.page import write_pages
+    from marl_sched.train.published.plan import load_plan
 
     if render and without_policies:
         raise InvalidOptionError("--render, --without-policies: expected one of them, together nothing is left to do")
@@ -71,8 +71,8 @@ def _fill(jobs: list[Job], cells: Cells, workers: int) -> None:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from marl_sched.train.tables.cells import describe
-    from marl_sched.train.tables.filling import fill, worker_processes
+    from marl_sched.train.published.cells import describe
+    from marl_sched.train.published.filling import fill, worker_processes
 
     if not jobs:
         return

@@ -13,7 +13,7 @@ from marl_sched.errors import InvalidOptionError
 if TYPE_CHECKING:
     from marl_sched.agents.base import Scheduler
     from marl_sched.domain import Domain
-    from marl_sched.train.evaluate import Settings
+    from marl_sched.train.evaluation.evaluate import Settings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +60,7 @@ class Selection:
     def resolve(self) -> Resolved:
         """The objects that the words stand for, or an error that says which word is wrong."""
         from marl_sched.domain import get_domain
-        from marl_sched.train.evaluate import Settings
+        from marl_sched.train.evaluation.evaluate import Settings
 
         domain = get_domain(self.env)
         words = asdict(self)

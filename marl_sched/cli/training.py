@@ -52,8 +52,8 @@ def export(
     ] = None,
 ) -> None:
     """Measure a run's best policy on unseen instances of every scale; write its weights and its card."""
-    from marl_sched.train.allocation import keep_freed_memory
     from marl_sched.train.export import export_policy
+    from marl_sched.train.malloc import keep_freed_memory
 
     if not name or Path(name).name != name or "." in name:
         raise InvalidOptionError(f"NAME: expected a name without dots and slashes, got {name!r}")
@@ -84,7 +84,7 @@ def curves(
     """Draw the learning curves of runs: a thin line for each, a thick one for the mean of a group."""
     from marl_sched.files import write_json
     from marl_sched.train.curves import learning_curves
-    from marl_sched.train.plots import curves_by_group, save
+    from marl_sched.train.evaluation.plots import curves_by_group, save
 
     if out.suffix == ".json":
         raise InvalidOptionError(f"--out: expected a picture such as curves.png, got {out}")

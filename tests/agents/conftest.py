@@ -100,7 +100,7 @@ def fleet() -> GraphSpec:
 
 @pytest.fixture
 def observe() -> Callable[..., Observation]:
-    """(graph, sizes, batch, seed) -> a random observation with hidden nodes; target 0 is visible and legal."""
+    """(graph, sizes, batch, seed) -> a random observation with hidden nodes; action 0 is visible and legal."""
     return random_observation
 
 

@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from marl_sched.agents import create_scheduler, load_policy, registry, scheduler_names
-from marl_sched.agents.cards import PolicyCard
-from marl_sched.agents.hetgat.network import HetGATNetwork
-from marl_sched.agents.learned.checkpoint import save_network
-from marl_sched.agents.learned.policy import NetworkPolicy
+from marl_sched.agents.networks.hetgat.network import HetGATNetwork
+from marl_sched.agents.policies.cards import PolicyCard
+from marl_sched.agents.policies.checkpoint import save_network
+from marl_sched.agents.policies.network_policy import NetworkPolicy
 from marl_sched.envs.airme.graph import graph_spec
 from marl_sched.errors import InvalidFileError, InvalidOptionError, UnknownNameError
 

@@ -1,4 +1,4 @@
-"""Tiny fleets whose luck is known beforehand, for tests of AirME.
+"""Tiny fleets whose noise is known beforehand, for tests of AirME.
 
 A Weibull density of scale s and shape 2000 is 0 to machine precision at every integer but s, where it is
 2000 / s / e > 1 for s < 735: such a part fails for certain at usage s. A scale of 1e9 never fails.
@@ -51,7 +51,7 @@ def fleet(*planes: tuple[AircraftType, float, int, int, bool], n_crews: int = 1)
 
 
 def play(simulator: AirmeSimulator, *hours: Sequence[int]) -> None:
-    """Play hours in row 0, each a target for every crew."""
+    """Play hours in row 0, each an action for every crew."""
     for choices in hours:
         simulator.play_hour(np.array([choices]))
 

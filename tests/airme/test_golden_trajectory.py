@@ -106,8 +106,8 @@ def take_turns(simulator: AirmeSimulator, until_hour: int = HOURS) -> None:
 def test_quoted_uniforms_are_the_simulators() -> None:
     episode_key = noise.episode_key(np.uint64(SEED), np.uint64(FLEET.identity), np.uint64(0))
     for (stream, hour, slot), expected in DRAWS.items():
-        moment = np.uint64(noise.moment_key(np.uint64(episode_key), hour))
-        assert noise.uniform(moment, stream, slot, 0) == expected
+        time_word = np.uint64(noise.time_key(np.uint64(episode_key), hour))
+        assert noise.uniform(time_word, stream, slot, 0) == expected
 
 
 def test_books_of_every_hour(episode: AirmeSimulator) -> None:

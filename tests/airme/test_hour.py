@@ -1,4 +1,4 @@
-"""What an hour does and does not do, on fleets whose luck is known beforehand."""
+"""What an hour does and does not do, on fleets whose noise is known beforehand."""
 
 from __future__ import annotations
 
@@ -171,11 +171,11 @@ class TestTurns:
     FLEET = fleet(*[(RESERVE, 10.0, 0, 0, True)] * 4, n_crews=3)
 
     @staticmethod
-    def turns(simulator: AirmeSimulator, *targets: int) -> list[tuple[int, int]]:
+    def turns(simulator: AirmeSimulator, *actions: int) -> list[tuple[int, int]]:
         seen = []
-        for target in targets:
+        for action in actions:
             seen.append((int(simulator.time[0]), int(simulator.acting[0])))
-            simulator.step(np.array([target]))
+            simulator.step(np.array([action]))
         return seen
 
     def test_full_asks_every_free_crew_in_ascending_order(self) -> None:
@@ -208,11 +208,11 @@ class TestTurns:
         assert simulator.conflict[0]
         assert simulator.snapshot(0)["crews"]["plane"].tolist() == [1, 0, 0]
 
-    def test_target_outside_the_space_raises(self) -> None:
+    def test_action_outside_the_space_raises(self) -> None:
         simulator = AirmeSimulator([self.FLEET])
-        for target in (-1, 5):
-            with pytest.raises(IllegalActionError, match=rf"target {target}: expected a plane's slot in \[0, 4\]"):
-                simulator.step(np.array([target]))
+        for action in (-1, 5):
+            with pytest.raises(IllegalActionError, match=rf"target {action}: expected a plane's slot in \[0, 4\]"):
+                simulator.step(np.array([action]))
         with pytest.raises(IllegalActionError, match="expected shape"):
             simulator.step(np.array([0, 0]))
 

@@ -30,10 +30,10 @@ def test_drawn_view_shows_what_the_local_view_with_its_numbers_shows(turns: int,
         for row, simulator in enumerate(fixed):
             for name, value in simulator.observe(simulator.acting).items():
                 np.testing.assert_array_equal(seen[name][row], value[0], err_msg=name)
-        targets = np.array([rng.choice(np.flatnonzero(mask)) if rng.random() < 0.6 else 0 for mask in drawn.legal()])
-        drawn.step(targets)
-        for simulator, target in zip(fixed, targets, strict=True):
-            simulator.step(np.array([target]))
+        actions = np.array([rng.choice(np.flatnonzero(mask)) if rng.random() < 0.6 else 0 for mask in drawn.legal()])
+        drawn.step(actions)
+        for simulator, action in zip(fixed, actions, strict=True):
+            simulator.step(np.array([action]))
 
 
 def test_drawn_numbers_cover_their_ranges_evenly_and_leave_the_asked_share_fresh() -> None:

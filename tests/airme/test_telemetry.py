@@ -29,15 +29,15 @@ def simulator(view, *, seed=3, horizon=60, **options) -> AirmeSimulator:
     return AIRME.simulator(AIRME.instances("small", 1, seed), view=view, horizon=horizon, seed=seed, **options)
 
 
-def beliefs(sim: AirmeSimulator) -> list:
+def local_states(sim: AirmeSimulator) -> list:
     frame = TELEMETRY.frame(sim)
-    return [TELEMETRY.belief(frame, agent) for agent in range(int(sim.n_agents[0]))]
+    return [TELEMETRY.local_state(frame, agent) for agent in range(int(sim.n_agents[0]))]
 
 
-def tell(belief, said: dict[str, bytes]) -> dict[str, np.ndarray]:
-    for channel in belief.channels:
-        belief.hear(channel, said[channel])
-    return belief.observe()
+def tell(local_state, said: dict[str, bytes]) -> dict[str, np.ndarray]:
+    for channel in local_state.channels:
+        local_state.hear(channel, said[channel])
+    return local_state.observe()
 
 
 def play_at_random(sim: AirmeSimulator, rng: np.random.Generator) -> None:
@@ -55,13 +55,13 @@ def assert_equal(believed, seen, where) -> None:
 @pytest.mark.parametrize("view", VIEWS, ids=str)
 @given(seed=st.integers(0, 2**31))
 @settings(max_examples=4)
-def test_belief_equals_observation_of_every_crew_at_every_turn(view, seed):
+def test_local_state_equals_observation_of_every_crew_at_every_turn(view, seed):
     sim, rng = simulator(view, seed=seed % 50, pad="small"), np.random.default_rng(seed)
-    crews = beliefs(sim)
+    crews = local_states(sim)
     while not sim.over[0]:
         said = TELEMETRY.messages(sim)
-        for agent, belief in enumerate(crews):
-            assert_equal(tell(belief, said), sim.observe(np.array([agent])), (agent, int(sim.time[0])))
+        for agent, local_state in enumerate(crews):
+            assert_equal(tell(local_state, said), sim.observe(np.array([agent])), (agent, int(sim.time[0])))
         play_at_random(sim, rng)
 
 
@@ -72,7 +72,7 @@ def test_random_play_meets_conflicts_and_repairs_of_ones_own():
         play_at_random(sim, rng)
         conflicts += bool(sim.conflict[0])
     assert conflicts > 10
-    assert (sim.state.told_at >= 0).sum() > conflicts
+    assert (sim.state.private_memory_at >= 0).sum() > conflicts
 
 
 @pytest.mark.parametrize("view", VIEWS, ids=str)
@@ -80,36 +80,36 @@ def test_latecomer_needs_only_the_newest_messages(view):
     sim, rng = simulator(view), np.random.default_rng(1)
     while sim.time[0] < 40:
         play_at_random(sim, rng)
-    for agent, belief in enumerate(beliefs(sim)):
-        assert_equal(tell(belief, TELEMETRY.messages(sim)), sim.observe(np.array([agent])), (agent,))
+    for agent, local_state in enumerate(local_states(sim)):
+        assert_equal(tell(local_state, TELEMETRY.messages(sim)), sim.observe(np.array([agent])), (agent,))
 
 
 def test_crew_listens_to_its_sector_now_to_neighbours_delayed_and_to_no_one_else():
     sim = simulator(LocalView(reach=1, comm=2, staleness=12), seed=0)
     n = int(sim.n_agents[0])
     assert n == 7
-    assert beliefs(sim)[0].channels == (
-        "crew/0/status", "crew/0/told", "crew/1/status", "crew/2/status", "crew/5/status", "crew/6/status",
+    assert local_states(sim)[0].channels == (
+        "crew/0/memory", "crew/0/status", "crew/1/status", "crew/2/status", "crew/5/status", "crew/6/status",
         "plane/0/now", "plane/1/delayed", "plane/6/delayed",
     )  # fmt: skip
 
 
 def test_without_staleness_neighbours_sectors_are_heard_as_they_are():
     sim = simulator(LocalView(reach=1, comm=0), seed=0)
-    assert beliefs(sim)[3].channels == ("crew/3/status", "plane/2/now", "plane/3/now", "plane/4/now")
+    assert local_states(sim)[3].channels == ("crew/3/status", "plane/2/now", "plane/3/now", "plane/4/now")
 
 
-def test_belief_refuses_a_channel_that_the_view_hides():
+def test_local_state_refuses_a_channel_that_the_view_hides():
     sim = simulator(LocalView(reach=1, comm=1, staleness=12), seed=0)
-    belief, said = beliefs(sim)[0], TELEMETRY.messages(sim)
-    for channel in set(said) - set(belief.channels):
+    local_state, said = local_states(sim)[0], TELEMETRY.messages(sim)
+    for channel in set(said) - set(local_state.channels):
         with pytest.raises(InvalidMessageError, match="not a channel"):
-            belief.hear(channel, said[channel])
+            local_state.hear(channel, said[channel])
 
 
 def perturb(sim: AirmeSimulator, *, sector: int, crew: int) -> None:
     """Change everything there is to change about the planes of a sector and about a crew."""
-    slots = np.arange(1, sim.max_targets)
+    slots = np.arange(1, sim.max_actions)
     planes = sim.state.planes[0, slots[(slots - 1) % int(sim.n_agents[0]) == sector]]
     planes["hours"] += 1
     planes["landings"] += 1
@@ -126,12 +126,12 @@ def test_hidden_sectors_crews_and_memories_change_nothing_that_a_crew_hears(stal
     sim, rng = simulator(LocalView(reach=1, comm=1, staleness=staleness), seed=0), np.random.default_rng(2)
     while sim.time[0] < 30:
         play_at_random(sim, rng)
-    belief, before = beliefs(sim)[0], TELEMETRY.messages(sim)
+    local_state, before = local_states(sim)[0], TELEMETRY.messages(sim)
     perturb(sim, sector=3, crew=3)
-    sim.state.told["hours"][:, 1:] += 1  # what other crews learnt
-    sim.state.rows["episode"] += np.uint64(1)  # the key of all luck to come
+    sim.state.private_memory["hours"][:, 1:] += 1  # what other crews learnt
+    sim.state.rows["episode"] += np.uint64(1)  # the key of all noise to come
     after = TELEMETRY.messages(sim)
-    assert [channel for channel in belief.channels if before[channel] != after[channel]] == []
+    assert [channel for channel in local_state.channels if before[channel] != after[channel]] == []
     assert before["plane/3/now"] != after["plane/3/now"]  # and yet something was changed
     assert before["crew/3/status"] != after["crew/3/status"]
 
@@ -139,20 +139,20 @@ def test_hidden_sectors_crews_and_memories_change_nothing_that_a_crew_hears(stal
 @pytest.mark.parametrize(("sector", "crew"), [(0, 0), (1, 1)])
 def test_visible_sectors_and_crews_do_change_what_a_crew_hears(sector, crew):
     sim = simulator(LocalView(reach=1, comm=1), seed=0)
-    belief, before = beliefs(sim)[0], TELEMETRY.messages(sim)
+    local_state, before = local_states(sim)[0], TELEMETRY.messages(sim)
     perturb(sim, sector=sector, crew=crew)
     after = TELEMETRY.messages(sim)
-    changed = {channel for channel in belief.channels if before[channel] != after[channel]}
+    changed = {channel for channel in local_state.channels if before[channel] != after[channel]}
     assert changed == {f"plane/{sector}/now", f"crew/{crew}/status"}
 
 
 def test_neighbours_present_stays_hidden_under_staleness():
     sim = simulator(LocalView(reach=1, comm=1, staleness=12), seed=0)
-    belief, before = beliefs(sim)[0], TELEMETRY.messages(sim)
+    local_state, before = local_states(sim)[0], TELEMETRY.messages(sim)
     perturb(sim, sector=1, crew=3)
     after = TELEMETRY.messages(sim)
     assert before["plane/1/now"] != after["plane/1/now"]
-    assert all(before[channel] == after[channel] for channel in belief.channels)
+    assert all(before[channel] == after[channel] for channel in local_state.channels)
 
 
 def test_who_chose_or_repairs_a_plane_is_not_on_the_wire():
@@ -188,7 +188,7 @@ def broken_payloads(good: bytes) -> dict[str, bytes]:
         "truncated": good[:-1],
         "not msgpack": b"\xc1\xff",
         "another version": msgspec.msgpack.encode({**said, "type": "airme.sector.2"}),
-        "another type": msgspec.msgpack.encode({"type": "airme.told.1", "planes": []}),
+        "another type": msgspec.msgpack.encode({"type": "airme.memory.1", "planes": []}),
         "a field too many": msgspec.msgpack.encode({**said, "extra": 1}),
         "a field too few": msgspec.msgpack.encode({"type": said["type"], "planes": said["planes"]}),
         "a negative hour": msgspec.msgpack.encode({**said, "hour": -1}),
@@ -200,14 +200,14 @@ def broken_payloads(good: bytes) -> dict[str, bytes]:
 @pytest.mark.parametrize("flaw", list(broken_payloads(TELEMETRY.messages(simulator(FullView()))["plane/0/now"])))
 def test_broken_payload_is_refused_and_changes_nothing(flaw):
     sim = simulator(FullView())
-    belief, said = beliefs(sim)[0], TELEMETRY.messages(sim)
-    before = {name: array.copy() for name, array in tell(belief, said).items()}
+    local_state, said = local_states(sim)[0], TELEMETRY.messages(sim)
+    before = {name: array.copy() for name, array in tell(local_state, said).items()}
     with pytest.raises(InvalidMessageError):
-        belief.hear("plane/0/now", broken_payloads(said["plane/0/now"])[flaw])
-    assert_equal(belief.observe(), before, (flaw,))
+        local_state.hear("plane/0/now", broken_payloads(said["plane/0/now"])[flaw])
+    assert_equal(local_state.observe(), before, (flaw,))
 
 
-def test_crew_that_does_not_exist_gets_no_belief():
+def test_crew_that_does_not_exist_gets_no_local_state():
     frame = TELEMETRY.frame(simulator(FullView(), seed=0))
     with pytest.raises(InvalidMessageError, match="crew 7 does not exist: the problem has crews 0 to 6"):
-        TELEMETRY.belief(frame, 7)
+        TELEMETRY.local_state(frame, 7)

@@ -43,7 +43,7 @@ class Hidden:
         slots = np.arange(1, int(simulator.state.rows["n_planes"][0]) + 1)
         apart = np.array([ring(self.agent, (slot - 1) % n, n) for slot in slots])
         stale = (apart > 0) & (apart <= view.reach) & (view.staleness > 0)
-        self.pictured = max(0, self.now - view.staleness)
+        self.snapshot_hour = max(0, self.now - view.staleness)
         self.out_of_reach, self.stale = slots[apart > view.reach], slots[stale]
         self.fresh = slots[(apart <= view.reach) & ~stale]
         self.silent_crews = np.array([c for c in range(n) if ring(self.agent, c, n) > view.comm], int)
@@ -52,9 +52,9 @@ class Hidden:
 
     def told(self) -> np.ndarray:
         """Stale slots of which the crew has a status that is not older than the picture."""
-        if not len(self.state.told_at):
+        if not len(self.state.private_memory_at):
             return self.stale[:0]
-        return self.stale[self.state.told_at[0, self.agent, self.stale] >= self.pictured]
+        return self.stale[self.state.private_memory_at[0, self.agent, self.stale] >= self.snapshot_hour]
 
     def scramble(self, rng: np.random.Generator) -> int:
         """Change everything that is hidden; how many records were changed."""
@@ -71,18 +71,22 @@ class Hidden:
             self.state.planes["chosen"][0, self.fresh[free]] = rng.choice([-1, *self.silent_crews], free.sum())
             theirs = np.isin(seen["crew"], self.silent_crews)
             self.state.planes["crew"][0, self.fresh[theirs]] = rng.choice(self.silent_crews, theirs.sum())
-        for moment in range(self.state.past.shape[1]):
-            picture = moment == self.pictured % self.state.past.shape[1]
-            unseen = np.setdiff1d(np.arange(1, self.n_planes + 1), self.stale if picture else [])
+        for hour in range(self.state.past.shape[1]):
+            snapshot = hour == self.snapshot_hour % self.state.past.shape[1]
+            unseen = np.setdiff1d(np.arange(1, self.n_planes + 1), self.stale if snapshot else [])
             hidden = np.union1d(unseen, self.told())
-            changed += self._scramble_planes(self.state.past[0, moment], hidden, rng)
-        if len(self.state.told_at):
+            changed += self._scramble_planes(self.state.past[0, hour], hidden, rng)
+        if len(self.state.private_memory_at):
             for crew in self.other_crews:
-                changed += self._scramble_planes(self.state.told[0, crew], np.arange(1, self.n_planes + 1), rng)
-                self.state.told_at[0, crew] = rng.integers(-1, self.now + 1, self.state.told_at.shape[2])
+                changed += self._scramble_planes(
+                    self.state.private_memory[0, crew], np.arange(1, self.n_planes + 1), rng
+                )
+                self.state.private_memory_at[0, crew] = rng.integers(
+                    -1, self.now + 1, self.state.private_memory_at.shape[2]
+                )
             unused = np.setdiff1d(np.arange(1, self.n_planes + 1), self.told())
-            self._scramble_planes(self.state.told[0, self.agent], unused, rng)
-            self.state.told_at[0, self.agent, self.out_of_reach] = rng.integers(-1, self.now + 1)
+            self._scramble_planes(self.state.private_memory[0, self.agent], unused, rng)
+            self.state.private_memory_at[0, self.agent, self.out_of_reach] = rng.integers(-1, self.now + 1)
         self.state.rows["sums"][0] = rng.random(3)
         self.state.rows["total_income"][0] = rng.random()
         self.state.series[0] = rng.random(self.state.series[0].shape)
@@ -141,20 +145,20 @@ def test_what_is_in_view_reaches_the_observation(view: LocalView, turns: int, se
     simulator = played(generate("small", np.random.default_rng(seed % 7)), view, turns, seed)
     hidden, before = Hidden(simulator, view), observed(simulator)
     told = hidden.told()
-    pictured = np.setdiff1d(hidden.stale, told)
+    snapshot_hour = np.setdiff1d(hidden.stale, told)
     state, agent = simulator.state, hidden.agent
     own = data.draw(st.sampled_from(hidden.fresh.tolist()))
     controls: dict[str, Callable[[], object]] = {
         "a plane that it sees as it is": lambda: state.planes["hours"][0].__setitem__(own, 777),
         "the own crew": lambda: state.crews["job_done"][0].__setitem__(agent, 5),
     }
-    if len(pictured):
-        moment = hidden.pictured % state.past.shape[1]
-        slot = data.draw(st.sampled_from(pictured.tolist()))
-        controls["the picture of a stale sector"] = lambda: state.past["hours"][0, moment].__setitem__(slot, 777)
+    if len(snapshot_hour):
+        hour = hidden.snapshot_hour % state.past.shape[1]
+        slot = data.draw(st.sampled_from(snapshot_hour.tolist()))
+        controls["the delayed snapshot of a stale sector"] = lambda: state.past["hours"][0, hour].__setitem__(slot, 777)
     if len(told):
         known = data.draw(st.sampled_from(told.tolist()))
-        controls["what the crew was told"] = lambda: state.told["hours"][0, agent].__setitem__(known, 777)
+        controls["what the crew was told"] = lambda: state.private_memory["hours"][0, agent].__setitem__(known, 777)
     heard = np.setdiff1d(hidden.other_crews, hidden.silent_crews)
     if len(heard):
         other = data.draw(st.sampled_from(heard.tolist()))
@@ -173,7 +177,7 @@ def test_mask_and_share_follow_from_what_is_visible(reach: int, comm: int, turns
     agent, n = int(simulator.acting[0]), instance.n_crews
     near = np.array([ring(agent, p % n, n) <= reach for p in range(instance.n_planes)])
     seen = observed(simulator)
-    padded = np.zeros(simulator.max_targets - 1, bool)
+    padded = np.zeros(simulator.max_actions - 1, bool)
     padded[: len(near)] = near
     np.testing.assert_array_equal(seen["plane_mask"][0, 1:], padded)
     assert seen["visible_share"][0] == np.float32(near.mean())

@@ -133,7 +133,7 @@ def test_output_that_cannot_be_written_is_refused_before_the_work(run, tmp_path,
     def never(*_, **__):
         pytest.fail("played although the results cannot be written")
 
-    monkeypatch.setattr("marl_sched.train.evaluate.evaluate", never)
+    monkeypatch.setattr("marl_sched.train.evaluation.evaluate.evaluate", never)
     (tmp_path / "file").write_text("")
     command = ("evaluate",) if option == "--json" else ("compare",)
     below_a_file = tmp_path / "file" / "r"

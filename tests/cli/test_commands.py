@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from marl_sched.agents.airme_rules import RULES
+from marl_sched.agents.airme.schedulers import RULES
 from marl_sched.cli import app
 from marl_sched.cli.app import app as application
 from marl_sched.domain import get_domain

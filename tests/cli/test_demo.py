@@ -4,12 +4,12 @@ import json
 
 import pytest
 
-from marl_sched.agents.airme_rules import RULES
+from marl_sched.agents.airme.schedulers import RULES
 from marl_sched.cli import demo
 from marl_sched.domain import get_domain
 from marl_sched.errors import DeploymentError
-from marl_sched.train.compare import play_episode
-from marl_sched.train.evaluate import Settings
+from marl_sched.train.evaluation.compare import play_episode
+from marl_sched.train.evaluation.evaluate import Settings
 
 
 def test_the_demo_has_seven_crews():

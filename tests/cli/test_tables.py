@@ -5,7 +5,7 @@ import sys
 import pytest
 
 from marl_sched.cli import pages
-from marl_sched.train.tables import plan as plans
+from marl_sched.train.published import plan as plans
 
 SIZE = {"instances": 2, "episodes": 1, "bound": {"price_vectors": 1, "evaluations": 1}}
 TINY = {

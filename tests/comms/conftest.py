@@ -158,9 +158,9 @@ def save_policy(tmp_path: Path) -> Callable[[int], str]:
 
     def save(seed: int) -> str:
         torch = pytest.importorskip("torch")
-        from marl_sched.agents.cards import PolicyCard
-        from marl_sched.agents.hetgat.network import HetGATNetwork
-        from marl_sched.agents.learned.checkpoint import save_network
+        from marl_sched.agents.networks.hetgat.network import HetGATNetwork
+        from marl_sched.agents.policies.cards import PolicyCard
+        from marl_sched.agents.policies.checkpoint import save_network
 
         graph = WorldOptions(seed=0).simulator().graph
         with torch.random.fork_rng():

@@ -302,7 +302,7 @@ def test_agent_drops_a_channel_of_a_snapshot_that_it_cannot_read(make_run, in_pr
     assert "world/snapshot, plane/0/now" in caplog.text
 
 
-def test_illegal_target_idles_the_agent_for_the_hour(make_run):
+def test_illegal_action_idles_the_agent_for_the_hour(make_run):
     run = make_run(options(hours=10), ["condition"] * 7)
 
     class Stubborn:

@@ -1,4 +1,4 @@
-"""What the tests of the faces share. Every test that takes `domain` runs for each domain that ships."""
+"""What the tests of the environment APIs share. Every test that takes `domain` runs for each domain that ships."""
 
 from __future__ import annotations
 
@@ -51,11 +51,11 @@ def largest_crew(domain: Domain) -> object:
 
 @pytest.fixture
 def padded(domain: Domain) -> object:
-    """A small instance with fewer agents and targets than the padding allows."""
+    """A small instance with fewer agents and actions than the padding allows."""
     for instance in domain.instances("small", 50, seed=0):
         simulator = make_simulator(domain, [instance])
         own = domain.simulator([instance], view=domain.make_view(None))
-        if own.max_agents < simulator.max_agents and own.max_targets < simulator.max_targets:
+        if own.max_agents < simulator.max_agents and own.max_actions < simulator.max_actions:
             return instance
     raise AssertionError("none of 50 instances is smaller than the padding")
 

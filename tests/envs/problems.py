@@ -1,4 +1,4 @@
-"""Problems that the tests of several faces play."""
+"""Problems that the tests of several environment APIs play."""
 
 from __future__ import annotations
 

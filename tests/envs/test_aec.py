@@ -6,7 +6,7 @@ from pettingzoo.test import api_test, seed_test
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
 from marl_sched import airme_v0
-from marl_sched.envs.aec import SchedulingAEC
+from marl_sched.envs.api.aec import SchedulingAEC
 from marl_sched.errors import IllegalActionError, InvalidOptionError, UnknownNameError
 from tests.envs.problems import HORIZON
 
@@ -58,10 +58,10 @@ def test_agents_are_the_instances_and_spaces_the_scales(domain, padded):
     env.reset(seed=1)
     assert env.agents == env.possible_agents[: len(env.agents)]
     assert len(env.agents) < len(env.possible_agents)
-    assert env.action_space(env.agents[0]).n == env.simulator.max_targets
+    assert env.action_space(env.agents[0]).n == env.simulator.max_actions
     observation = env.observe(env.agent_selection)
     own = domain.simulator([padded], view=env.simulator.view)
-    assert not observation["action_mask"][own.max_targets :].any()
+    assert not observation["action_mask"][own.max_actions :].any()
 
 
 def test_agents_stay_the_same_until_all_end_together(domain, pick):
@@ -116,7 +116,7 @@ def test_the_return_is_the_objective_times_the_hours(pick):
     assert returns == pytest.approx(env.simulator.objectives()["availability"][0] * HORIZON["airme"], abs=1e-12)
 
 
-def test_no_reward_is_paid_while_others_act_at_the_same_moment():
+def test_no_reward_is_paid_while_others_act_at_the_same_decision_epoch():
     env = make("airme")
     env.reset(seed=2)
     n = len(env.agents)
@@ -203,7 +203,7 @@ def test_a_masked_choice_raises_and_leaves_the_turn_to_be_taken(domain, pick, bi
     agent, mask = env.agent_selection, env.last()[0]["action_mask"]
     forbidden = int(np.flatnonzero(mask == 0)[0])
     before = bits(env.simulator.snapshot(0))
-    with pytest.raises(IllegalActionError, match=rf"{agent}: target {forbidden} is not legal at time \d+; legal: 0"):
+    with pytest.raises(IllegalActionError, match=rf"{agent}: action {forbidden} is not legal at time \d+; legal: 0"):
         env.step(forbidden)
     assert env.agent_selection == agent
     assert bits(env.simulator.snapshot(0)) == before
@@ -227,7 +227,7 @@ def test_stepping_after_the_end_raises(domain, pick):
         env.step(0)
 
 
-def test_after_the_end_no_target_but_0_is_legal(domain, pick):
+def test_after_the_end_no_action_but_0_is_legal(domain, pick):
     env = make(domain)
     env.reset(seed=1)
     for _, (observation, _, terminated, truncated, info), _ in play(env, pick):

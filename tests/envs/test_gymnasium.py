@@ -10,7 +10,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import marl_sched
-from marl_sched.envs.gymnasium_env import SchedulingEnv
+from marl_sched.envs.api.gymnasium_env import SchedulingEnv
 from marl_sched.errors import IllegalActionError, InvalidOptionError, UnknownNameError
 from tests.envs.problems import HORIZON, fleet
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 
-from marl_sched.envs.parallel import SchedulingParallel
+from marl_sched.envs.api.parallel import SchedulingParallel
 from marl_sched.errors import IllegalActionError, InvalidOptionError, UnknownNameError
-from marl_sched.noise import Stream, moment_key, uniform
+from marl_sched.noise import Stream, time_key, uniform
 from tests.envs.problems import HORIZON, fleet
 
 
@@ -16,10 +16,10 @@ def make(domain, **options):
     return SchedulingParallel(domain, **{"horizon": HORIZON[getattr(domain, "name", domain)], **options})
 
 
-def winner(env, target, agents):
-    """Who has the target by the rule, worked out from the noise alone."""
-    moment = np.uint64(moment_key(env.simulator.episode_keys[0], env.simulator.time[0]))
-    draws = {agent: uniform(moment, int(Stream.CONFLICT), target, agent) for agent in agents}
+def winner(env, action, agents):
+    """Who has the action by the rule, worked out from the noise alone."""
+    time_word = np.uint64(time_key(env.simulator.episode_keys[0], env.simulator.time[0]))
+    draws = {agent: uniform(time_word, int(Stream.CONFLICT), action, agent) for agent in agents}
     return min(draws, key=draws.__getitem__)
 
 
@@ -70,7 +70,7 @@ def test_every_observation_lies_in_its_space(domain, view, padded, pick):
     assert all(seen["action_mask"].sum() == 1 for seen in observations.values())
 
 
-def test_of_all_who_choose_one_target_the_smallest_draw_has_it():
+def test_of_all_who_choose_one_action_the_smallest_draw_has_it():
     env = make("airme", scale=None, instance=fleet(6, 4))
     won = set()
     for seed in range(12):
@@ -97,10 +97,10 @@ def mix_by_hand(x):
 
 
 def test_the_draw_is_that_of_its_definition_for_keys_of_all_sizes():
-    def by_hand(key, time, target, agent):
-        moment = mix_by_hand((key ^ time) + 0x9E3779B97F4A7C15)
-        name = (int(Stream.CONFLICT) << 56) | (agent << 40) | target
-        return mix_by_hand(moment + (name + 1) * 0x9E3779B97F4A7C15) >> 11
+    def by_hand(key, time, action, agent):
+        time_word = mix_by_hand((key ^ time) + 0x9E3779B97F4A7C15)
+        name = (int(Stream.CONFLICT) << 56) | (agent << 40) | action
+        return mix_by_hand(time_word + (name + 1) * 0x9E3779B97F4A7C15) >> 11
 
     env = make("airme", scale=None, instance=fleet(6, 4))
     high = 0
@@ -116,8 +116,8 @@ def test_the_draw_is_that_of_its_definition_for_keys_of_all_sizes():
 STALE = {"kind": "local", "reach": 2, "comm": 0, "staleness": 6}
 
 
-def test_losers_of_a_target_learn_what_they_would_in_aec(bits):
-    from marl_sched.envs.aec import SchedulingAEC
+def test_losers_of_an_action_learn_what_they_would_in_aec(bits):
+    from marl_sched.envs.api.aec import SchedulingAEC
 
     options = {"scale": None, "instance": fleet(6, 4), "view": STALE}
     env, aec = make("airme", **options), SchedulingAEC("airme", horizon=HORIZON["airme"], **options)
@@ -131,13 +131,13 @@ def test_losers_of_a_target_learn_what_they_would_in_aec(bits):
             seen = observations[f"crew_{loser}"]
             assert infos[f"crew_{loser}"]["conflict"]
             assert seen["action_mask"][3] == 0  # somebody has it in hand
-            assert env.simulator.state.told_at[0, loser, 3] == 0
-            assert env.simulator.state.told["chosen"][0, loser, 3] == best
+            assert env.simulator.state.private_memory_at[0, loser, 3] == 0
+            assert env.simulator.state.private_memory["chosen"][0, loser, 3] == best
         won.add(best)
         if best == 0:  # AEC's turns come in the same order
             aec.reset(seed=seed)
-            for target in (3, 3, 0, 3):
-                aec.step(target)
+            for action in (3, 3, 0, 3):
+                aec.step(action)
             for _ in range(5):
                 assert env.simulator.time[0] == aec.simulator.time[0]
                 assert bits(env.simulator.snapshot(0)) == bits(aec.simulator.snapshot(0))
@@ -158,15 +158,15 @@ def test_losers_in_murse_idle_a_unit_and_know_who_has_the_task():
     free = env.simulator.free_agents(0).tolist()
     assert len(free) > 1
     legal = np.all([observations[env.agents[i]]["action_mask"] for i in free], axis=0)
-    target = int(np.flatnonzero(legal)[1])
-    best = winner(env, target, free)
-    infos = env.step(dict.fromkeys(env.agents, target))[-1]
+    action = int(np.flatnonzero(legal)[1])
+    best = winner(env, action, free)
+    infos = env.step(dict.fromkeys(env.agents, action))[-1]
     state = env.simulator.state
-    assert state.tasks["agent"][0, target - 1] == best
+    assert state.tasks["agent"][0, action - 1] == best
     assert {agent for agent, info in infos.items() if info["conflict"]} == {env.agents[i] for i in free if i != best}
     assert state.rows["conflicts"][0] == len(free) - 1
     assert env.simulator.time[0] == 1
-    assert all((state.told[0, i, target - 1] >= 0).all() for i in free if i != best)
+    assert all((state.private_memory[0, i, action - 1] >= 0).all() for i in free if i != best)
 
 
 def test_an_agent_that_has_acted_is_given_no_second_turn(domain):
@@ -241,7 +241,7 @@ def test_rewards_of_any_agent_sum_to_the_objective(domain, pick):
 
 
 def test_choices_that_do_not_meet_give_the_trace_of_aec(bits):
-    from marl_sched.envs.aec import SchedulingAEC
+    from marl_sched.envs.api.aec import SchedulingAEC
 
     parallel, aec = make("airme"), SchedulingAEC("airme", horizon=HORIZON["airme"])
     observations, _ = parallel.reset(seed=4)
@@ -267,9 +267,9 @@ def test_errors_come_before_anything_happens(domain, bits):
     before = bits(env.simulator.snapshot(0))
     idle = dict.fromkeys(env.agents, 0)
     first = env.agents[0]
-    with pytest.raises(IllegalActionError, match=f"{first}: target 10000: expected one in"):
+    with pytest.raises(IllegalActionError, match=f"{first}: action 10000: expected one in"):
         env.step(idle | {first: 10_000})
-    with pytest.raises(IllegalActionError, match=f"{first}: expected an integer target, got 0.5"):
+    with pytest.raises(IllegalActionError, match=f"{first}: expected an integer action, got 0.5"):
         env.step(idle | {first: 0.5})
     with pytest.raises(UnknownNameError, match="agent 'nobody'"):
         env.step(idle | {"nobody": 0})

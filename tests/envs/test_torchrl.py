@@ -10,8 +10,8 @@ from torchrl.envs import TransformedEnv, step_mdp  # noqa: E402
 from torchrl.envs.transforms import ActionMask, StepCounter  # noqa: E402
 from torchrl.envs.utils import check_env_specs  # noqa: E402
 
-from marl_sched.envs.sampling import random_legal  # noqa: E402
-from marl_sched.envs.torchrl_env import SchedulingTorchRL  # noqa: E402
+from marl_sched.envs.api.sampling import random_legal  # noqa: E402
+from marl_sched.envs.api.torchrl_env import SchedulingTorchRL  # noqa: E402
 from marl_sched.errors import IllegalActionError, InvalidOptionError, UnknownNameError  # noqa: E402
 from tests.envs.problems import HORIZON  # noqa: E402
 
@@ -205,9 +205,9 @@ def test_an_illegal_choice_raises_and_changes_nothing(domain, bits):
     before = [bits(env.simulator.snapshot(b)) for b in range(3)]
     agent = domain.agent_name(int(td["acting"][1]))
     forbidden = int(np.flatnonzero(td["action_mask"][1].numpy() == 0)[0])
-    for target in (forbidden, -1, env.simulator.max_targets):
-        td["action"] = torch.tensor([0, target, 0])
-        with pytest.raises(IllegalActionError, match=f"row 1: {agent}: target {target} is not legal; legal: 0"):
+    for action in (forbidden, -1, env.simulator.max_actions):
+        td["action"] = torch.tensor([0, action, 0])
+        with pytest.raises(IllegalActionError, match=f"row 1: {agent}: action {action} is not legal; legal: 0"):
             env.step(td)
     assert [bits(env.simulator.snapshot(b)) for b in range(3)] == before
 
@@ -217,7 +217,7 @@ def test_rows_that_are_over_ignore_their_choice(domain):
     td = env.reset()
     while not td["done"].all():
         td = step_mdp(env.step(env.rand_action(td)))
-    td["action"] = torch.tensor([env.simulator.max_targets - 1])
+    td["action"] = torch.tensor([env.simulator.max_actions - 1])
     assert env.step(td)["next", "reward"].item() == 0.0
 
 
@@ -233,7 +233,7 @@ def test_a_padded_instance_hides_what_it_lacks(domain, padded):
     env = make(domain, batch_size=None, instances=[padded])
     own = domain.simulator([padded], view=env.simulator.view)
     rollout = env.rollout(20)
-    assert not rollout["action_mask"][..., own.max_targets :].any()
+    assert not rollout["action_mask"][..., own.max_actions :].any()
     assert rollout["acting"].max() < own.max_agents
 
 

@@ -1,4 +1,4 @@
-"""One rule makes views of what users write, whichever command, face or file it comes from."""
+"""One rule makes views of what users write, whichever command, environment API or file it comes from."""
 
 import inspect
 import math

@@ -8,8 +8,8 @@ from marl_sched.errors import InvalidFileError
 from marl_sched.files import read_json, replacing, write_json
 
 
-def fail_halfway(target):
-    with replacing(target) as temporary:
+def fail_halfway(action):
+    with replacing(action) as temporary:
         temporary.write_text('{"half": ')
         raise RuntimeError("halfway")
 
@@ -26,22 +26,22 @@ def test_missing_folders_are_made(tmp_path):
 
 
 def test_failed_write_leaves_the_old_file_and_nothing_else(tmp_path):
-    target = tmp_path / "a.json"
-    write_json(target, "old")
+    action = tmp_path / "a.json"
+    write_json(action, "old")
     with pytest.raises(RuntimeError, match="halfway"):
-        fail_halfway(target)
-    assert read_json(target) == "old"
+        fail_halfway(action)
+    assert read_json(action) == "old"
     assert [path.name for path in tmp_path.iterdir()] == ["a.json"]
 
 
 def test_target_is_untouched_until_the_block_ends(tmp_path):
-    target = tmp_path / "a.txt"
-    target.write_text("old")
-    with replacing(target) as temporary:
+    action = tmp_path / "a.txt"
+    action.write_text("old")
+    with replacing(action) as temporary:
         temporary.write_text("new")
-        assert target.read_text() == "old"
+        assert action.read_text() == "old"
         assert temporary.parent == tmp_path  # a rename never crosses file systems
-    assert target.read_text() == "new"
+    assert action.read_text() == "new"
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), {1, 2}])

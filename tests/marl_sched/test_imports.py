@@ -21,12 +21,22 @@ ALLOWED = {
     "comms": {"core", "envs", "agents", "comms", "configs"},
     "cli": {"core", "envs", "agents", "train", "comms", "configs", "cli"},
 }
-# Public modules that are a domain's face, and therefore stand on the room that holds it.
+# Public modules that are a domain's environment API, and therefore stand on the room that holds it.
 FRONT_DOORS = {"marl_sched.airme_v0": "envs", "marl_sched.murse_v0": "envs"}
 
-# What may need torch: the TorchRL face, learned policies and training. Comparing rules does not.
-NEEDS_TORCH = ("marl_sched.envs.torchrl", "marl_sched.agents.hetgat", "marl_sched.agents.learned", "marl_sched.train.")
-DOES_NOT = ("marl_sched.train.evaluate", "marl_sched.train.compare", "marl_sched.train.plots")
+# What may need torch: the TorchRL environment, learned policies and training. Comparing rules does not.
+NEEDS_TORCH = (
+    "marl_sched.envs.api.torchrl",
+    "marl_sched.agents.networks",
+    "marl_sched.agents.policies.checkpoint",
+    "marl_sched.agents.policies.network_policy",
+    "marl_sched.train.",
+)
+DOES_NOT = (
+    "marl_sched.train.evaluation.evaluate",
+    "marl_sched.train.evaluation.compare",
+    "marl_sched.train.evaluation.plots",
+)
 
 BLOCKER = """
 import sys

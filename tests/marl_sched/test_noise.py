@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from marl_sched.noise import Stream, episode_key, integer, mix, moment_key, uniform, uniforms, word
+from marl_sched.noise import Stream, episode_key, integer, mix, time_key, uniform, uniforms, word
 
 WORD = (1 << 64) - 1
 GAMMA = 0x9E3779B97F4A7C15
@@ -29,13 +29,13 @@ def absorb(key: int, part: int) -> int:
 
 
 def word_by_hand(seed: int, instance: int, episode: int, time: int, stream: int, entity: int, draw: int) -> int:
-    moment = absorb(absorb(absorb(absorb(0, seed), instance), episode), time)
+    time_word = absorb(absorb(absorb(absorb(0, seed), instance), episode), time)
     name = (stream << 56) | (draw << 40) | entity
-    return mix_by_hand((moment + (name + 1) * GAMMA) & WORD)
+    return mix_by_hand((time_word + (name + 1) * GAMMA) & WORD)
 
 
 def key_of(seed: int, instance: int, episode: int, time: int) -> np.uint64:
-    return np.uint64(moment_key(np.uint64(episode_key(np.uint64(seed), np.uint64(instance), episode)), time))
+    return np.uint64(time_key(np.uint64(episode_key(np.uint64(seed), np.uint64(instance), episode)), time))
 
 
 def draws(*, seed=1, instance=2, episode=0, time=5, stream=16, entity=3, draw=0, size=N) -> np.ndarray:
@@ -105,7 +105,7 @@ def test_batched_uniforms_are_the_single_ones():
     keys = np.array([episode_key(7, i, 1) for i in range(20)], np.uint64)
     times, entities = np.arange(20), np.arange(20)[::-1].copy()
     batched = uniforms(keys, times, Stream.POLICY, entities, 3)
-    single = [uniform(np.uint64(moment_key(keys[b], times[b])), Stream.POLICY, entities[b], 3) for b in range(20)]
+    single = [uniform(np.uint64(time_key(keys[b], times[b])), Stream.POLICY, entities[b], 3) for b in range(20)]
     assert batched.tolist() == single
 
 
@@ -160,9 +160,11 @@ def test_parts_of_the_name_are_not_exchangeable():
     assert len(set(swapped)) == len(swapped)
 
 
-def test_draws_of_one_moment_never_share_a_word():
-    moment = key_of(1, 2, 3, 4)
-    words = {int(word(moment, s, e, d)) for s in (0, 1, 16, 255) for e in (0, 1, 2, 2**40 - 1) for d in (0, 1, 65535)}
+def test_draws_of_one_time_never_share_a_word():
+    time_word = key_of(1, 2, 3, 4)
+    words = {
+        int(word(time_word, s, e, d)) for s in (0, 1, 16, 255) for e in (0, 1, 2, 2**40 - 1) for d in (0, 1, 65535)
+    }
     assert len(words) == 4 * 4 * 3
 
 

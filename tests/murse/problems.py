@@ -32,10 +32,10 @@ def three_tasks(**changed: Any) -> MurseInstance:
     return problem([[4, 4], [3, 3], [2, 2]], **(values | changed))
 
 
-def played(simulator: MurseSimulator, targets: list[int]) -> MurseSimulator:
+def played(simulator: MurseSimulator, actions: list[int]) -> MurseSimulator:
     """The one-row simulator after these choices in turn."""
-    for target in targets:
-        simulator.step(np.array([target]))
+    for action in actions:
+        simulator.step(np.array([action]))
     return simulator
 
 

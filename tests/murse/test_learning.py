@@ -21,7 +21,7 @@ from marl_sched.envs.murse.learning import (
     sample_curves,
     whole,
 )
-from marl_sched.noise import episode_key, moment_key
+from marl_sched.noise import episode_key, time_key
 
 LIMITS = (15, 100)
 START = (30.0, 100.0)
@@ -33,8 +33,8 @@ def curves(n: int, seed: int = 0) -> np.ndarray:
 
 def execute(curve: np.ndarray, repetitions: int, entity: int, episode: int = 0) -> int:
     """One stochastic whole duration."""
-    moment = np.uint64(moment_key(np.uint64(episode_key(1, 2, episode)), repetitions))
-    return whole(drawn_duration(curve, repetitions, EXPONENTIAL, moment, entity), *LIMITS)
+    time_word = np.uint64(time_key(np.uint64(episode_key(1, 2, episode)), repetitions))
+    return whole(drawn_duration(curve, repetitions, EXPONENTIAL, time_word, entity), *LIMITS)
 
 
 def test_equation_5_1_by_hand():
@@ -66,8 +66,8 @@ def test_sampled_curves_keep_the_bounds_of_section_5_7_1():
 
 def test_stochastic_durations_have_the_curves_mean_and_spread():
     curve = np.array([50.0, 3.0, 10.0, 4.0, 0.1, 0.0])
-    moment = np.uint64(moment_key(episode_key(0, 0, 0), 0))
-    drawn = np.array([drawn_duration(curve, 0, EXPONENTIAL, moment, entity) for entity in range(20_000)])
+    time_word = np.uint64(time_key(episode_key(0, 0, 0), 0))
+    drawn = np.array([drawn_duration(curve, 0, EXPONENTIAL, time_word, entity) for entity in range(20_000)])
     assert drawn.mean() == pytest.approx(60.0, abs=0.15)
     assert drawn.std() == pytest.approx(5.0, abs=0.1)
 

@@ -181,12 +181,12 @@ def test_measures_of_each_round_count_an_infeasible_one_with_its_worst_case():
 
 def test_decision_rewards_sum_to_the_makespan():
     simulator = MurseSimulator([three_tasks()], rewards="decision")
-    rewards = [float(played(simulator, [target]).reward[0]) for target in (1, 2, 3)]
+    rewards = [float(played(simulator, [action]).reward[0]) for action in (1, 2, 3)]
     assert rewards == [-4.0, -3.0, -4.0]
     divided = MurseSimulator([three_tasks()], rewards="decision", divisor=2.0)
-    assert [float(played(divided, [target]).reward[0]) for target in (1, 2, 3)] == [-2.0, -1.5, -4.0]
+    assert [float(played(divided, [action]).reward[0]) for action in (1, 2, 3)] == [-2.0, -1.5, -4.0]
     failed = MurseSimulator([three_tasks()], rewards="decision")
-    assert sum(float(played(failed, [target]).reward[0]) for target in (1, 0, 0, 0, 0, 0)) == -18.0
+    assert sum(float(played(failed, [action]).reward[0]) for action in (1, 0, 0, 0, 0, 0)) == -18.0
 
 
 def test_published_reward_pays_for_failing_and_ours_does_not():

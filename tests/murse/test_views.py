@@ -126,7 +126,7 @@ def hide_and_change(
     """Change everything in row 0 that the viewer must not know; how many things were changed."""
     state, instance = simulator.state, simulator.instances[0]
     n, m, now = instance.n_tasks, instance.n_agents, int(state.rows["clock"][0])
-    tasks, pairs, told = state.tasks[0], state.pairs[0], state.told[0]
+    tasks, pairs, told = state.tasks[0], state.pairs[0], state.private_memory[0]
     places = [np.zeros(2) if a["last_task"] < 0 else instance.locations[a["last_task"]] for a in state.agents[0, :m]]
     heard = [a == viewer or np.hypot(*(places[a] - places[viewer])) <= view.limits[1] for a in range(m)]
     near = np.hypot(*(instance.locations - places[viewer]).T) <= view.limits[0]
@@ -208,9 +208,9 @@ def test_rows_and_padding_do_not_influence_what_is_seen(instance, seed):
             corner = large[name][2][tuple(slice(0, size) for size in array[0].shape)]
             np.testing.assert_array_equal(corner, array[0], err_msg=name)
             assert np.count_nonzero(large[name][2] > 0) == np.count_nonzero(array[0] > 0)
-        target = rng.choice(np.flatnonzero(small["action_mask"][0]))
-        alone.step(np.array([target]))
-        together.step(np.array([0, 0, target]))
+        action = rng.choice(np.flatnonzero(small["action_mask"][0]))
+        alone.step(np.array([action]))
+        together.step(np.array([0, 0, action]))
     assert alone.round_results(0).tolist() == together.round_results(2).tolist()
 
 

@@ -25,8 +25,8 @@ def flags(*values: int) -> torch.Tensor:
     return torch.tensor(values, dtype=torch.bool)[:, None]
 
 
-def test_a_turn_within_a_moment_discounts_nothing_and_one_that_passes_time_discounts_by_it():
-    # Two turns in one moment, the second lets 2 units pass. gamma = 1/2, lambda = 1.
+def test_a_turn_within_a_decision_epoch_discounts_nothing_and_one_that_passes_time_discounts_by_it():
+    # Two turns in one decision epoch, the second lets 2 units pass. gamma = 1/2, lambda = 1.
     # delta_1 = 3 + 0.25 * 8 - 1 = 4; delta_0 = 0 + 1 * 1 - 2 = -1; A_1 = 4; A_0 = -1 + 1 * 4 = 3.
     advantages, targets = generalised_advantages(
         column(0, 3), column(0, 2), column(2, 1, 8), flags(1, 1, 1), flags(1, 1, 1), discount=0.5, trace=1.0

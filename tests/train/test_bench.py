@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from marl_sched.agents.airme_bench import play_hours, prepared_hours
+from marl_sched.agents.airme.bench import play_hours, prepared_hours
 from marl_sched.domain import get_domain
 from marl_sched.errors import InvalidOptionError
 from marl_sched.train import bench

@@ -8,7 +8,7 @@ import torch
 
 from marl_sched.domain import get_domain
 from marl_sched.envs.airme.views import LocalView
-from marl_sched.envs.torchrl_env import SchedulingTorchRL
+from marl_sched.envs.api.torchrl_env import SchedulingTorchRL
 from marl_sched.train.collect import EpisodeCollector, InstanceSource, Rollout, SegmentCollector
 
 
@@ -18,15 +18,15 @@ def environment(rows: int = 4, episodes: int = 1, horizon: int = 100) -> Schedul
 
 
 def pick(observation: dict[str, torch.Tensor], uniform: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
-    """Any legal target, all alike."""
+    """Any legal action, all alike."""
     legal = observation["action_mask"].numpy() > 0
     rank = np.floor(uniform * legal.sum(axis=1))
-    targets = (legal.cumsum(axis=1) > rank[:, None]).argmax(axis=1)
-    return torch.from_numpy(targets), torch.from_numpy(-np.log(legal.sum(axis=1)).astype(np.float32))
+    actions = (legal.cumsum(axis=1) > rank[:, None]).argmax(axis=1)
+    return torch.from_numpy(actions), torch.from_numpy(-np.log(legal.sum(axis=1)).astype(np.float32))
 
 
 def same(a: Rollout, b: Rollout) -> bool:
-    columns = ("targets", "log_probs", "rewards", "elapsed", "times", "valid", "alive")
+    columns = ("actions", "log_probs", "rewards", "elapsed", "times", "valid", "alive")
     views = (("observation", name) for name in a.observation)
     centrals = (("central", name) for name in a.central)
     return all(torch.equal(getattr(a, name), getattr(b, name)) for name in columns) and all(

@@ -13,7 +13,7 @@ from marl_sched.errors import InvalidFileError, InvalidOptionError, UnknownNameE
 from marl_sched.files import read_json, write_json
 from marl_sched.train.config import RunRecord, load_config
 from marl_sched.train.curves import learning_curves, trailing_mean
-from marl_sched.train.plots import curves_by_group
+from marl_sched.train.evaluation.plots import curves_by_group
 
 
 def made_up(directory: Path, *overrides: str, scores: list[float], every: int = 10) -> Path:

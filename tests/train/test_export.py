@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from marl_sched.agents.cards import read_card
-from marl_sched.agents.learned.policy import NetworkPolicy
+from marl_sched.agents.policies.cards import read_card
+from marl_sched.agents.policies.network_policy import NetworkPolicy
 from marl_sched.cli.app import run as run_command
 from marl_sched.domain import get_domain
 from marl_sched.envs.airme.views import LocalView
-from marl_sched.train.evaluate import Settings, evaluate_scheduler
+from marl_sched.train.evaluation.evaluate import Settings, evaluate_scheduler
 from marl_sched.train.export import export_policy
 from marl_sched.train.run import train_from_overrides
 

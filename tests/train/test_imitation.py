@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from marl_sched.agents.base import AdvantageScheduler
-from marl_sched.agents.cards import read_card
-from marl_sched.agents.hetgat.network import HetGATNetwork
+from marl_sched.agents.networks.hetgat.network import HetGATNetwork
+from marl_sched.agents.policies.cards import read_card
 from marl_sched.domain import get_domain
 from marl_sched.envs.airme.views import LocalView
-from marl_sched.envs.torchrl_env import SchedulingTorchRL
+from marl_sched.envs.api.torchrl_env import SchedulingTorchRL
 from marl_sched.errors import InvalidOptionError
 from marl_sched.train.collect import InstanceSource, Rollout, SegmentCollector
 from marl_sched.train.config import ImitationConfig

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from marl_sched.agents.hetgat.network import HetGATCritic, HetGATNetwork
+from marl_sched.agents.networks.hetgat.network import HetGATCritic, HetGATNetwork
 from marl_sched.domain import get_domain
 from marl_sched.envs.airme.views import LocalView
-from marl_sched.envs.torchrl_env import SchedulingTorchRL
+from marl_sched.envs.api.torchrl_env import SchedulingTorchRL
 from marl_sched.errors import InvalidOptionError
 from marl_sched.train.collect import EpisodeCollector, InstanceSource, Rollout, SegmentCollector
 from marl_sched.train.config import PpoConfig
@@ -112,12 +112,12 @@ def test_the_sampler_follows_the_policys_distribution():
     state = env.reset()
     observation = {name: state[name].expand(500, *state[name].shape[1:]) for name in env.simulator.arrays}
     uniform = (np.arange(500) + 0.5) / 500
-    targets, log_probs = Sampler(policy)(observation, uniform)
+    actions, log_probs = Sampler(policy)(observation, uniform)
     with torch.no_grad():
         expected = policy({name: array[:1] for name, array in observation.items()}).softmax(-1)[0]
-        counts = torch.bincount(targets, minlength=len(expected)) / 500
+        counts = torch.bincount(actions, minlength=len(expected)) / 500
         assert torch.allclose(counts, expected, atol=3e-3)
-        assert torch.allclose(log_probs.exp(), expected[targets], atol=1e-5)
+        assert torch.allclose(log_probs.exp(), expected[actions], atol=1e-5)
 
 
 def test_kept_turns_weigh_as_much_as_all_turns_in_expectation():
@@ -137,7 +137,7 @@ def test_kept_turns_weigh_as_much_as_all_turns_in_expectation():
 def test_a_better_choice_becomes_more_probable():
     policy, _ = networks()
     rollout = EpisodeCollector(environment(rows=4, episodes=2), central=False).collect(Sampler(policy), 10)
-    good = rollout.targets == 0
+    good = rollout.actions == 0
     estimate = Estimate(torch.where(good, 1.0, -1.0).double(), None, 0.0, rollout.valid[:-1])
     samples = samples_of(policy, rollout, estimate, 1.0, np.random.default_rng(0))
     idle = samples["target"] == 0

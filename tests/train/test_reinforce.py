@@ -10,18 +10,18 @@ import pytest
 import torch
 
 from marl_sched.agents import load_policy
-from marl_sched.agents.cards import read_card
-from marl_sched.agents.learned.decima import DecimaNetwork
-from marl_sched.agents.learned.deeprm import DeepRMNetwork
-from marl_sched.agents.learned.network import slots_of
+from marl_sched.agents.networks.decima import DecimaNetwork
+from marl_sched.agents.networks.deeprm import DeepRMNetwork
+from marl_sched.agents.networks.network import slots_of
+from marl_sched.agents.policies.cards import read_card
 from marl_sched.cli.app import run as run_command
 from marl_sched.domain import get_domain
-from marl_sched.envs.torchrl_env import SchedulingTorchRL
+from marl_sched.envs.api.torchrl_env import SchedulingTorchRL
 from marl_sched.files import read_json, write_json
 from marl_sched.train.collect import EpisodeCollector, InstanceSource
 from marl_sched.train.config import HetGATConfig, RunRecord, load_config, load_record
 from marl_sched.train.estimators import StepBaseline
-from marl_sched.train.evaluate import Settings, evaluate_scheduler
+from marl_sched.train.evaluation.evaluate import Settings, evaluate_scheduler
 from marl_sched.train.learner import PolicyGradient
 from marl_sched.train.ppo import Ppo, Sampler
 from marl_sched.train.run import resume, train_from_overrides
@@ -66,7 +66,7 @@ def test_an_update_is_a_step_along_the_gradient_of_reinforce(architecture: str):
 
 
 def plain_loss(network: torch.nn.Module, rollout) -> torch.Tensor:
-    turns, rows = rollout.targets.shape
+    turns, rows = rollout.actions.shape
     to_go = np.zeros((LENGTH + 1, rows))
     hourly = np.zeros((LENGTH, rows))
     for t in range(turns):
@@ -87,7 +87,7 @@ def plain_loss(network: torch.nn.Module, rollout) -> torch.Tensor:
     total = torch.zeros(())
     for (t, b), advantage in zip(taken, advantages, strict=True):
         seen = {name: values[t, b : b + 1] for name, values in rollout.observation.items()}
-        total = total - float(advantage) * network(seen).log_softmax(-1)[0, rollout.targets[t, b]]
+        total = total - float(advantage) * network(seen).log_softmax(-1)[0, rollout.actions[t, b]]
     return total / len(taken)
 
 

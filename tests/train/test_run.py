@@ -9,8 +9,8 @@ import pytest
 from safetensors.torch import load_file
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from marl_sched.agents.cards import read_card, source_revision
-from marl_sched.agents.learned.policy import NetworkPolicy
+from marl_sched.agents.policies.cards import read_card, source_revision
+from marl_sched.agents.policies.network_policy import NetworkPolicy
 from marl_sched.errors import InvalidFileError, InvalidOptionError
 from marl_sched.files import read_json, write_json
 from marl_sched.train.checkpoint import Counters

@@ -9,9 +9,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from marl_sched.agents.hetgat.network import HetGATNetwork
+from marl_sched.agents.networks.hetgat.network import HetGATNetwork
 from marl_sched.domain import get_domain
-from marl_sched.envs.torchrl_env import SchedulingTorchRL
+from marl_sched.envs.api.torchrl_env import SchedulingTorchRL
 from marl_sched.train.collect import InstanceSource, Rollout
 from marl_sched.train.config import RunRecord, load_config
 from marl_sched.train.export import knowledge
@@ -44,7 +44,7 @@ class Hourly(nn.Module):
 def test_advantages_are_what_an_episode_still_earns_less_the_critics_value(rollout: Rollout):
     estimate = StateValueBaseline(Hourly(), discount=1.0).estimate(rollout)
     for row in range(4):
-        taken = [t for t in range(rollout.targets.shape[0]) if rollout.valid[t, row]]
+        taken = [t for t in range(rollout.actions.shape[0]) if rollout.valid[t, row]]
         for t in taken:
             # the last turn's reward may reach beyond the cut, by the hours in which no crew was free
             earned = 0.0

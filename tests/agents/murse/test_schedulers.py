@@ -14,9 +14,9 @@ from marl_sched.agents.murse.genetic import GeneticEdf, evolve
 from marl_sched.agents.murse.list_schedule import edf_priority, edf_schedule, list_schedule
 from marl_sched.agents.murse.optimal import ExactScheduler, RollingScheduler
 from marl_sched.agents.murse.problem import Round
+from marl_sched.agents.murse.schedulers import RULES
 from marl_sched.agents.murse.tercio import Tercio, overload
 from marl_sched.agents.murse.windows import induced_deadlines, task_windows
-from marl_sched.agents.murse_rules import RULES
 from marl_sched.agents.registry import create_scheduler
 from marl_sched.domain import get_domain
 from marl_sched.envs.airme.simulator import AirmeSimulator
@@ -150,7 +150,7 @@ def test_evolution_is_the_same_for_the_same_episode_and_differs_between_episodes
     assert not (np.array_equal(runs[0].tasks, runs[2].tasks) and np.array_equal(runs[0].agents, runs[2].agents))
 
 
-def test_work_that_does_not_fit_before_a_moment_is_found_by_the_analytical_test():
+def test_work_that_does_not_fit_before_a_time_is_found_by_the_analytical_test():
     # two tasks of 4 units are due at 7; on one robot they need 8, on two they fit
     whole = Round.of(problem([[4, 4], [4, 4], [9, 9]], deadlines=[7, 7, -1]))
     windows = task_windows(whole)

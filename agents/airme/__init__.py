@@ -1,0 +1,1 @@
+"""Rules, index policy and upper bound of AirME."""

@@ -1,0 +1,69 @@
+"""Decima (Mao et al. 2019) as the dissertation adapts it (section 6.5.1): one sum over the tasks, one score for each.
+
+    h_s  = g( sum over m in N(s) of f(h_m) )        equation 6.9
+    q_m  = q( f(h_m), h_s )
+    p(m) = softmax over m in M of q_m               equation 6.10
+
+The tasks are the nodes that decisions are on (AirME's planes). What the text leaves open is settled so: N(s) are all
+visible tasks, those in somebody's hands and the null task included; M are those that the action mask allows, of which
+the null task always is one. The state node's own features do not enter, as equation 6.9 has no place for them, and
+neither do agents (crews), which the bipartite graph does not contain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import cast
+
+from torch import Tensor, nn
+from torch.nn import functional
+
+from marl_sched.agents.networks.network import (
+    PolicyNetwork,
+    explore_at_first,
+    fully_connected,
+    mask_logits,
+    visible_features,
+)
+from marl_sched.agents.policies.cards import DecimaSizes
+from marl_sched.graph import GraphSpec
+
+
+class DecimaNetwork(PolicyNetwork):
+    """f, g and q as separate networks; no weight depends on the number of tasks.
+
+    Args:
+        spec: the metagraph.
+        hidden: width of every layer, and of the embeddings f(h_m) and h_s.
+        layers: fully connected layers of each of the three networks, ReLU between them.
+    """
+
+    permutation_equivariant = True
+    sizes: DecimaSizes
+
+    def __init__(self, spec: GraphSpec, *, hidden: int = 64, layers: int = 3) -> None:
+        super().__init__()
+        self.spec = spec
+        self.sizes = DecimaSizes(hidden=hidden, layers=layers)
+        self.f = fully_connected(len(spec.node(spec.decision_of).features), hidden, hidden, layers)
+        self.g = fully_connected(hidden, hidden, hidden, layers)
+        self.q = fully_connected(2 * hidden, hidden, 1, layers)
+        explore_at_first(self.q)
+
+    def forward(self, observation: Mapping[str, Tensor], weights: None = None) -> Tensor:
+        """Logits (B, n_actions), see PolicyNetwork."""
+        task = self.spec.decision_of
+        features = visible_features(observation, task, next(self.parameters()).dtype)
+        embedded = self.f(features)
+        hidden = observation[f"{task}_mask"] == 0
+        state = self.g(embedded.masked_fill(hidden[..., None], 0.0).sum(1, keepdim=True))
+        return mask_logits(self._scores(embedded, state).squeeze(-1), observation)
+
+    def _scores(self, embedded: Tensor, state: Tensor) -> Tensor:
+        """The scores q (B, n, 1) of embeddings (B, n, hidden), each beside its graph's state (B, 1, hidden).
+
+        The first layer's product with the state is the same for all tasks of a graph, and is made once.
+        """
+        first, rest = cast(nn.Linear, self.q[0]), self.q[1:]
+        of_task, of_state = first.weight.split(embedded.shape[-1], dim=1)
+        return rest(functional.linear(embedded, of_task, first.bias) + functional.linear(state, of_state))

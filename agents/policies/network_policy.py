@@ -1,0 +1,167 @@
+"""A trained network as a scheduler: NumPy arrays in, actions out."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple, get_args
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from marl_sched.agents.base import ObservationScheduler
+from marl_sched.agents.networks.batches import logits_in_blocks
+from marl_sched.agents.networks.network import PolicyNetwork
+from marl_sched.agents.policies.cards import Mode, PolicyCard, check_graph
+from marl_sched.agents.policies.checkpoint import load_network
+from marl_sched.errors import InvalidOptionError
+from marl_sched.graph import ACTION_MASK, STATE, TIME, VISIBLE_SHARE, GraphSpec
+from marl_sched.simulation import TurnSimulator
+
+Observation = Mapping[str, np.ndarray]
+_NEVER = -1  # before every simulated time
+
+
+class _FirstLogits(NamedTuple):
+    """Of every row of a batch, the simulated time, int64 (B,), of the decision epoch whose first logits are kept."""
+
+    time: np.ndarray
+    logits: np.ndarray  # float32 (B, n_actions)
+
+
+class NetworkPolicy(ObservationScheduler):
+    """Decides by a copy of a network, whatever its architecture.
+
+    At batch size 1 a choice is a function of the observation's bits, the padding included; in a larger batch
+    logits agree within 1e-5, as the network then sees it in blocks without what nobody sees
+    (marl_sched.agents.networks.batches).
+
+    Args:
+        network: on any device; the copy is on the CPU.
+        name: as users type it.
+        mode: `greedy` takes the most probable action, ties to the lowest index; `sample` picks by inverse
+            distribution with the uniform that it is given. `one_pass` samples for all agents of a decision epoch from
+            what the first of them saw, without the actions that are taken by then: how the dissertation plays what was
+            trained with one decision an hour (scheme Single, section 6.3.1). On a lone observation it samples.
+        card: what the weights are, if they come from a file.
+    """
+
+    def __init__(
+        self, network: PolicyNetwork, *, name: str = "unsaved", mode: Mode = "greedy", card: PolicyCard | None = None
+    ) -> None:
+        if mode not in get_args(Mode):
+            raise InvalidOptionError(
+                f"mode of policy {name}: expected one of {', '.join(get_args(Mode))}, got {mode!r}"
+            )
+        self.name, self.mode, self.card = name, mode, card
+        self.samples = mode != "greedy"
+        self.graph: GraphSpec = network.spec
+        self._network = copy.deepcopy(network).cpu().requires_grad_(False)
+        with torch.inference_mode():
+            self._weights = self._network.weights()
+        sizes = {node.name: 1 for node in self.graph.nodes}
+        self._arrays = [array for array in self.graph.arrays(sizes) if array not in (TIME, VISIBLE_SHARE)]
+        self._n_features = {node.name: len(node.features) for node in self.graph.nodes}
+        self._n_features[STATE] = len(self.graph.state_features)
+        self._checked: GraphSpec | None = None
+        self._first = _FirstLogits(np.zeros(0, np.int64), np.zeros((0, 0), np.float32))
+
+    @classmethod
+    def load(cls, path: str | Path, *, mode: Mode | None = None, graph: GraphSpec | None = None) -> NetworkPolicy:
+        """A policy from its files (marl_sched.agents.policies.checkpoint); its name is the file's.
+
+        `mode` None is its card's. Raises InvalidFileError for damaged files, or if the policy was trained on
+        another metagraph than `graph`.
+        """
+        network, card = load_network(path)
+        if graph is not None:
+            check_graph(Path(path).with_suffix(".json"), card, graph)
+        return cls(network, name=Path(path).stem, mode=card.mode if mode is None else mode, card=card)
+
+    def start(self, simulator: TurnSimulator, rows: np.ndarray) -> None:
+        """Forget what was seen in earlier episodes of these rows."""
+        if self._first.time.shape == rows.shape:
+            self._first.time[rows] = _NEVER
+
+    def decide(self, simulator: TurnSimulator) -> np.ndarray:
+        """Observe for every acting agent under the simulator's view, then choose.
+
+        Raises InvalidFileError if the policy was trained on another metagraph than the simulator's, InvalidOptionError
+        for the mode one_pass under a view that hides something.
+        """
+        if simulator.graph is not self._checked:
+            if self.card is not None:
+                check_graph(f"{self.name}.json", self.card, simulator.graph)
+            self._checked = simulator.graph
+        agents = simulator.acting
+        rows = np.flatnonzero(agents >= 0)
+        actions = np.zeros(simulator.batch, np.int64)
+        if len(rows):
+            observation = simulator.observe(agents)
+            if len(rows) < simulator.batch:  # rows that are over would cost as much as the others
+                observation = {name: values[rows] for name, values in observation.items()}
+            one_pass = self.mode == "one_pass"
+            logits = self._of_epoch(simulator, rows, observation) if one_pass else self.logits(observation)
+            actions[rows] = self._pick(logits, simulator.policy_noise(agents)[rows])
+        return actions
+
+    def _of_epoch(self, simulator: TurnSimulator, rows: np.ndarray, observation: Observation) -> np.ndarray:
+        """The logits of the first turn of each row's decision epoch, for the actions that are still legal."""
+        if simulator.view.kind != "full":
+            raise InvalidOptionError(
+                f"mode of policy {self.name}: one_pass shares what the first agent sees, so it is for the full view; "
+                f"got view {simulator.view.kind}"
+            )
+        legal = observation[ACTION_MASK] != 0
+        if self._first.logits.shape != (simulator.batch, legal.shape[1]):
+            never = np.full(simulator.batch, _NEVER)
+            self._first = _FirstLogits(never, np.zeros((simulator.batch, legal.shape[1]), np.float32))
+        new = self._first.time[rows] != simulator.time[rows]
+        if new.any():
+            self._first.logits[rows[new]] = self.logits({name: values[new] for name, values in observation.items()})
+            self._first.time[rows] = simulator.time[rows]
+        return np.where(legal, self._first.logits[rows], np.finfo(np.float32).min)
+
+    def choose(self, observation: Observation, uniform: np.ndarray) -> np.ndarray:
+        """Actions int64 (B,) from batched observations and uniforms float64 (B,) in [0, 1)."""
+        return self._pick(self.logits(observation), uniform)
+
+    def _pick(self, logits: np.ndarray, uniform: np.ndarray) -> np.ndarray:
+        return inverse_distribution(logits, uniform) if self.samples else logits.argmax(1)
+
+    @torch.inference_mode()
+    def logits(self, observation: Observation) -> np.ndarray:
+        """Logits float32 (B, n_actions) of batched observations; the lowest finite number where illegal.
+
+        Raises InvalidOptionError for an observation without the arrays or the features that it was trained on.
+        """
+        for name, n_features in self._n_features.items():
+            shape = np.shape(observation[name]) if name in observation else ()
+            if not shape or shape[-1] != n_features:
+                raise InvalidOptionError(
+                    f"observation: {name}: policy {self.name} expects {n_features} features, got shape {shape}"
+                )
+        tensors = {name: _tensor(observation[name]) for name in self._arrays}
+        if len(tensors[ACTION_MASK]) == 1:
+            return self._network(tensors, self._weights).numpy()
+        return logits_in_blocks(self._network, tensors, self._weights).numpy()
+
+
+def inverse_distribution(logits: np.ndarray, uniform: np.ndarray) -> np.ndarray:
+    """For each row the first action whose cumulated probability exceeds the row's uniform.
+
+    logits (B, n_actions), with at least one that is not the lowest finite number; uniform float64 (B,) in
+    [0, 1); returns int64 (B,). Actions of probability zero are never picked.
+    """
+    weights = np.exp(logits.astype(np.float64) - logits.max(axis=1, keepdims=True))
+    cumulated = weights.cumsum(axis=1)
+    # A uniform next to 1 may round up to the total; the largest number below the total still has an action.
+    level = np.minimum(uniform * cumulated[:, -1], np.nextafter(cumulated[:, -1], 0.0))
+    return (cumulated > level[:, None]).argmax(axis=1)
+
+
+def _tensor(array: np.ndarray) -> Tensor:
+    """A tensor on the array's memory; arrays from a message are read-only, which PyTorch has no notion of."""
+    return torch.from_numpy(array if array.flags.writeable else array.copy())

@@ -1,0 +1,252 @@
+"""TorchRL: a native batched environment at the granularity of decisions.
+
+    env = SchedulingTorchRL("airme", batch_size=1024, view="local")
+    rollout = env.rollout(100, break_when_any_done=False)    # random legal choices
+
+One step takes one turn in every row. The tensordict holds the acting agents' observations, one entry per array
+of the problem graph (see marl_sched.graph), and
+
+    action       (B,)    int64    an action
+    acting       (B,)    int64    the agent whose turn it is, -1 where the episode is over
+    elapsed      (B,)    int64    simulated time that the last step let pass, the exponent of a semi-Markov discount
+    conflict     (B,)    bool     the last choice was legal in its agent's view and impossible in truth
+    reward       (B, 1)  float64  team reward of that time
+    done, terminated, truncated  (B, 1) bool
+
+Random choices through `rand_action`, and so rollouts without a policy, respect the action mask. TorchRL's
+RandomPolicy samples from the action spec, which knows of no mask unless the transform ActionMask or
+`env.action_spec.update_mask` tells it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Binary, Bounded, Categorical, Composite, TensorSpec, Unbounded
+from torchrl.envs import EnvBase
+
+from marl_sched.domain import Domain
+from marl_sched.envs.api.options import as_domain, as_instance
+from marl_sched.envs.api.sampling import first_illegal, random_legal
+from marl_sched.errors import IllegalActionError, InvalidOptionError
+from marl_sched.graph import ACTION_MASK, ArraySpec
+from marl_sched.noise import as_seed
+
+_CPU = torch.device("cpu")
+
+InstanceSource = Callable[[int, int], Any]
+"""(row, number of the row's episode from 0) -> the instance to play, or its file."""
+
+
+class SchedulingTorchRL(EnvBase):
+    """A batch of rows of a domain as a TorchRL environment; the module's page lists the tensordict's entries.
+
+    Without `instances` and `source`, row b plays the instance drawn by `default_rng([seed, b])` in all its
+    episodes. A row's first episode is number 0, as in the Other environment APIs, and every reset goes on to the next.
+    Rows that share an instance take turns in counting, and with a source all rows do, so that no two rows
+    ever play the same episode.
+
+    Args:
+        domain: a registered domain or its name.
+        batch_size: number of rows B; may be left out where `instances` are given.
+        scale: of generated instances, and whose largest instance sets the padding; None pads to `instances`.
+        instances: one per row, or files of such.
+        source: gives a row's instance at each of its resets, and once more when the environment is made.
+        view, objective, horizon: as every domain's simulator takes them; None is the domain's default.
+        seed: of instances, noise and random actions; `set_seed` sets another, for each row from its next reset on.
+        device: where tensors live; the simulator runs on the CPU.
+        options: further options of the domain's simulator; unknown ones raise TypeError.
+    """
+
+    batch_locked = True
+
+    def __init__(
+        self,
+        domain: str | Domain,
+        *,
+        batch_size: int | None = None,
+        scale: str | None = "small",
+        instances: Sequence[Any] | None = None,
+        source: InstanceSource | None = None,
+        view: Any = None,
+        objective: str | None = None,
+        horizon: int | None = None,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+        **options: Any,
+    ) -> None:
+        _check(batch_size, scale, instances, source)
+        rows = len(instances) if instances is not None else int(batch_size or 1)
+        super().__init__(device=torch.device(device), batch_size=torch.Size([rows]))
+        self.domain = as_domain(domain)
+        self.scale = scale if scale is None else self.domain.require_scale(scale)
+        self._source = source
+        self._given = None if instances is None else [as_instance(self.domain, i) for i in instances]
+        self._set_seed(seed)
+        self.simulator = self.domain.simulator(
+            self._instances(range(rows), 0),
+            view=self.domain.make_view(view),
+            objective=self.domain.objectives[0] if objective is None else objective,
+            horizon=self.domain.default_horizon if horizon is None else horizon,
+            seed=self._seed,
+            pad=self.scale,
+            **options,
+        )
+        self._mask = np.zeros((rows, self.simulator.max_actions), np.int8)
+        self._scratch = self.simulator.new_observation()
+        self._layout = [(name, (rows, *s.shape), _torch_dtype(s.dtype)) for name, s in self.simulator.arrays.items()]
+        self._make_specs()
+
+    def _make_specs(self) -> None:
+        batch = self.batch_size
+        arrays = {name: _array_spec(spec, batch) for name, spec in self.simulator.arrays.items()}
+        self.observation_spec = Composite(
+            **arrays,
+            acting=Bounded(-1, self.simulator.max_agents - 1, batch, dtype=torch.int64),
+            elapsed=Unbounded(batch, dtype=torch.int64),
+            conflict=Binary(shape=batch, dtype=torch.bool),
+            shape=batch,
+        ).to(self.device)
+        self.action_spec = Categorical(self.simulator.max_actions, batch, dtype=torch.int64, device=self.device)
+        self.reward_spec = Unbounded((*batch, 1), dtype=torch.float64, device=self.device)
+        done = {name: Binary(shape=(*batch, 1), dtype=torch.bool) for name in ("done", "terminated", "truncated")}
+        self.done_spec = Composite(**done, shape=batch).to(self.device)
+
+    def _set_seed(self, seed: int | None) -> None:
+        self._seed = as_seed(seed)
+        self._rng = np.random.default_rng(self._seed)
+        self._count = np.full(self.batch_size[0], -1, np.int64)  # of each row's running episode
+        if self._source is None:
+            rows = self.batch_size[0]
+            self._fixed = self._given or self.domain.instances(str(self.scale), rows, self._seed)
+            self._first, self._stride = _turns([instance.identity for instance in self._fixed])
+        else:
+            self._first, self._stride = np.arange(self.batch_size[0]), np.full(self.batch_size[0], self.batch_size[0])
+
+    def _instances(self, rows: Sequence[int] | np.ndarray, count: int | np.ndarray) -> list[Any]:
+        if self._source is None:
+            return [self._fixed[b] for b in rows]
+        counts = np.broadcast_to(count, len(rows))
+        return [as_instance(self.domain, self._source(int(b), int(n))) for b, n in zip(rows, counts, strict=True)]
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
+        """Start new episodes in the rows marked `_reset`, in all if nothing is marked."""
+        rows = np.ones(self.batch_size[0], bool)
+        marked = None if tensordict is None else tensordict.get("_reset", None)
+        if marked is not None:
+            rows = marked.reshape(self.batch_size).cpu().numpy()
+        self._start(rows)
+        return self._tensordict(self._observed())
+
+    def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Start new episodes in the rows that are done, as EnvBase does, and look again in those rows alone."""
+        rows = tensordict.get("done").reshape(self.batch_size).cpu().numpy()
+        if not rows.any():
+            return tensordict
+        self._start(rows)
+        self.simulator.observe(np.where(rows, self.simulator.acting, -1), self._scratch)
+        self._mask[rows] = self._scratch[ACTION_MASK][rows]
+        index = torch.from_numpy(np.flatnonzero(rows))
+        entries = self._books()
+        for name, _, _ in self._layout:
+            seen = tensordict.get(name).cpu().clone()  # the finished step keeps its own tensors
+            seen[index] = torch.from_numpy(self._scratch[name])[index]
+            entries[name] = seen
+        return tensordict.update(self._tensordict(entries))
+
+    def _start(self, rows: np.ndarray) -> None:
+        """Begin the next episode of `rows`, bool (B,)."""
+        self._count[rows] += 1
+        self.simulator.reset(
+            rows,
+            seed=self._seed,
+            instances=self._instances(np.flatnonzero(rows), self._count[rows]),
+            episodes=(self._first + self._count * self._stride)[rows].tolist(),
+        )
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Take a turn in every row; IllegalActionError names the first row whose choice is not legal."""
+        simulator = self.simulator
+        actions = tensordict.get("action").cpu().numpy()
+        bad = first_illegal(self._mask, actions, simulator.acting)
+        if bad >= 0:
+            legal = ", ".join(map(str, np.flatnonzero(self._mask[bad])))
+            agent = self.domain.agent_name(int(simulator.acting[bad]))
+            raise IllegalActionError(f"row {bad}: {agent}: action {actions[bad]} is not legal; legal: {legal}")
+        simulator.step(actions)
+        return self._tensordict(self._observed() | {"reward": _column(simulator.reward)})
+
+    def _observed(self) -> dict[str, torch.Tensor]:
+        """Everything but the reward, in fresh tensors."""
+        simulator = self.simulator
+        out = {name: torch.empty(shape, dtype=dtype) for name, shape, dtype in self._layout}
+        arrays = {name: tensor.numpy() for name, tensor in out.items()}
+        simulator.observe(simulator.acting, arrays)
+        np.copyto(self._mask, arrays[ACTION_MASK])
+        return out | self._books()
+
+    def _books(self) -> dict[str, torch.Tensor]:
+        """Who acts, what the last step let happen and who is done, in fresh tensors."""
+        simulator, out = self.simulator, {}
+        out["acting"] = torch.from_numpy(simulator.acting.copy())
+        out["elapsed"] = torch.from_numpy(simulator.elapsed.copy())
+        out["conflict"] = torch.from_numpy(simulator.conflict.copy())
+        out["terminated"] = _column(simulator.terminated)
+        out["truncated"] = _column(simulator.truncated)
+        out["done"] = out["terminated"] | out["truncated"]
+        return out
+
+    def _tensordict(self, entries: dict[str, torch.Tensor]) -> TensorDict:
+        out = TensorDict(entries, self.batch_size, device=_CPU)
+        return out if self.device == _CPU else out.to(self.device)
+
+    def rand_action(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
+        """A legal action for each row, all with the same probability; see marl_sched.envs.api.sampling."""
+        if tensordict is None:
+            tensordict = TensorDict({}, self.batch_size, device=self.device)
+        seen = tensordict.get(ACTION_MASK, None)
+        mask = self._mask if seen is None else seen.cpu().numpy()
+        actions = random_legal(mask, self._rng.random(self.batch_size[0]))
+        return tensordict.set("action", torch.from_numpy(actions).to(self.device))
+
+
+def _check(batch_size: int | None, scale: str | None, instances: Any, source: Any) -> None:
+    """Raise InvalidOptionError where the options of the constructor contradict each other."""
+    if instances is None and (batch_size is None or batch_size < 1):
+        raise InvalidOptionError(f"batch_size: expected at least 1 row, got {batch_size}")
+    if instances is not None and batch_size not in (None, len(instances)):
+        raise InvalidOptionError(f"instances: expected one per row ({batch_size}), got {len(instances)}")
+    if instances is not None and source is not None:
+        raise InvalidOptionError("source: expected either instances or a source of them, got both")
+    if scale is None and instances is None:
+        raise InvalidOptionError("scale: expected a scale's name where no instances are given")
+
+
+def _turns(identities: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """For each row how many rows before it, and how many in all, have the same instance, int64 (B,) each."""
+    _, index, counts = np.unique(np.array(identities, np.uint64), return_inverse=True, return_counts=True)
+    order = np.argsort(index, kind="stable")
+    starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    first = np.empty(len(index), np.int64)
+    first[order] = np.arange(len(index)) - starts[index[order]]
+    return first, counts[index]
+
+
+def _column(values: np.ndarray) -> torch.Tensor:
+    """A row's value as (B, 1), the shape that TorchRL's losses expect, on its own memory."""
+    return torch.from_numpy(values.copy()).unsqueeze(-1)
+
+
+def _torch_dtype(dtype: np.dtype) -> torch.dtype:
+    return torch.from_numpy(np.empty(0, dtype)).dtype
+
+
+def _array_spec(spec: ArraySpec, batch: torch.Size) -> TensorSpec:
+    shape, dtype = torch.Size([*batch, *spec.shape]), _torch_dtype(spec.dtype)
+    if np.isinf(spec.low) or np.isinf(spec.high):
+        return Unbounded(shape, dtype=dtype)
+    return Bounded(spec.low, spec.high, shape, dtype=dtype)

@@ -1,0 +1,247 @@
+"""A cell of the tables: one scheduler on all instances of a scale, kept as JSON under the hash of its inputs.
+
+    docs/results/airme/0a1b2c3d4e5f6071.json
+
+The hash covers everything that decides the scores: whoever plays (the weights' SHA-256, if it is a policy), what is
+played, and `SCHEMA`, which counts the changes of simulators, rules, bounds, networks and this format that make old
+cells void: code is not hashed, whoever changes what it scores raises the number. A cell that exists is therefore never
+played again, and one whose inputs have changed is not found.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from msgspec import Struct
+
+from marl_sched.agents.policies.cards import read_card, source_revision
+from marl_sched.agents.registry import create_scheduler
+from marl_sched.domain import get_domain
+from marl_sched.errors import InvalidFileError
+from marl_sched.files import read_json, write_json
+from marl_sched.train.evaluation.evaluate import Settings, evaluate_scheduler
+
+SCHEMA = 1
+DECIMALS = 6
+
+
+class Play(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind", tag="play"):
+    """Inputs of a cell that is played: whose scores, on what, how often.
+
+    `view` is as JSON, with all its options. `mode` is a policy's, by its card; a rule has none, and no weights.
+    """
+
+    env: str
+    scale: str
+    objective: str
+    scheduler: str
+    weights_sha256: str | None
+    mode: str | None
+    view: dict[str, Any]
+    options: dict[str, Any]
+    instances: int
+    episodes: int
+    seed: int
+    horizon: int
+    schema: int = SCHEMA
+
+
+class Bound(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind", tag="bound"):
+    """Inputs of a cell that is proved: what no scheduler's expected M1 passes on each instance."""
+
+    env: str
+    scale: str
+    objective: str
+    instances: int
+    seed: int
+    horizon: int
+    price_vectors: int
+    evaluations: int
+    schema: int = SCHEMA
+
+
+Inputs = Play | Bound
+
+
+class Training(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What a learned scheduler's card says of its making."""
+
+    command: str
+    seed: int
+    view: dict[str, Any]
+    knowledge: str
+
+
+class Cell(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A finished cell.
+
+    Attributes:
+        inputs: what it was made of.
+        M1: each instance's mean over its episodes, or its bound.
+        episode_std: root of the mean over instances of the variance between an instance's episodes.
+        visible_share: share of the graph that acting agents saw.
+        needs: what the scheduler uses beyond what its agents see, "" for nothing.
+        training: of a learned scheduler.
+        seconds: that it took.
+        revision: of the source that made it.
+    """
+
+    inputs: Inputs
+    M1: list[float]
+    episode_std: float | None = None
+    visible_share: float | None = None
+    needs: str = ""
+    training: Training | None = None
+    seconds: float
+    revision: str
+
+
+@dataclass(frozen=True)
+class Job:
+    """A cell to be made; `weights` is where those of a policy are.
+
+    `besides` are cells that the same episodes give: those of a rule that does not heed the objective, for others.
+    """
+
+    inputs: Inputs
+    weights: Path | None = None
+    besides: tuple[Play, ...] = ()
+
+    @property
+    def cost(self) -> float:
+        """About how long it takes compared to other jobs: measured on a core, in thousandths of a second."""
+        inputs = self.inputs
+        size = 2.5 ** list(get_domain(inputs.env).scales).index(inputs.scale)  # planes double, crews double
+        if isinstance(inputs, Bound):
+            return 5000.0 * inputs.price_vectors * inputs.evaluations * inputs.horizon / 720
+        rows = inputs.instances * inputs.episodes * inputs.horizon / 720
+        return rows * size * (10.0 if self.weights is None else 60.0)
+
+
+def describe(inputs: Inputs) -> str:
+    """A cell in words, for people who wait for it: `condition, medium, profit, view local reach 1, ...`."""
+    if isinstance(inputs, Bound):
+        return f"the bound, {inputs.scale}, {inputs.objective}"
+    view = ", ".join(f"{name} {value}" for name, value in inputs.view.items() if name != "kind")
+    details = [f"view {inputs.view['kind']} {view}".strip(), *(f"{k} {v}" for k, v in inputs.options.items())]
+    return f"{inputs.scheduler}, {inputs.scale}, {inputs.objective}, {', '.join(details)}"
+
+
+def digest(inputs: Inputs) -> str:
+    """The name of a cell: 16 hexadecimal digits of the SHA-256 of its inputs as canonical JSON."""
+    return hashlib.sha256(msgspec.json.encode(inputs, order="sorted")).hexdigest()[:16]
+
+
+def weights_sha256(path: Path) -> str:
+    """SHA-256 of a policy's weights file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+class Cells:
+    """The cells in a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def path(self, inputs: Inputs) -> Path:
+        """Where the cell of these inputs is, or would be."""
+        return self.folder / f"{digest(inputs)}.json"
+
+    def read(self, inputs: Inputs) -> Cell | None:
+        """The cell of these inputs, None if there is none yet; InvalidFileError if it is damaged or another's."""
+        path = self.path(inputs)
+        if not path.exists():
+            return None
+        try:
+            cell = msgspec.convert(read_json(path), Cell)
+        except msgspec.ValidationError as error:
+            raise InvalidFileError(path, "", f"a cell of schema {SCHEMA} ({error})") from error
+        if cell.inputs != inputs:
+            raise InvalidFileError(path, "inputs", "those that its name is the hash of", digest(cell.inputs))
+        if len(cell.M1) != inputs.instances:
+            raise InvalidFileError(path, "M1", f"{inputs.instances} numbers", len(cell.M1))
+        return cell
+
+    def write(self, cell: Cell) -> Path:
+        """Keep a cell, whole or not at all; its path."""
+        path = self.path(cell.inputs)
+        write_json(path, msgspec.to_builtins(cell))
+        return path
+
+
+def make(job: Job) -> list[Cell]:
+    """Play or prove a job's cell, and those besides."""
+    if isinstance(job.inputs, Bound):
+        return [_prove(job.inputs)]
+    return _play(job.inputs, job.weights, job.besides)
+
+
+def _play(inputs: Play, weights: Path | None, besides: Sequence[Play]) -> list[Cell]:
+    domain = get_domain(inputs.env)
+    training = None
+    if weights is not None:
+        if weights_sha256(weights) != inputs.weights_sha256:
+            raise InvalidFileError(weights, "", "the weights that were there when the cells were listed")
+        card = read_card(weights.with_suffix(".json"))
+        training = Training(command=card.command, seed=card.seed, view=card.view, knowledge=card.training_knowledge)
+    settings = Settings(
+        episodes=inputs.episodes,
+        seed=inputs.seed,
+        view=domain.make_view(inputs.view),
+        objective=inputs.objective,
+        horizon=inputs.horizon,
+        scale=inputs.scale,
+        options=inputs.options,
+    )
+    scheduler = (
+        create_scheduler(inputs.scheduler, domain)
+        if weights is None
+        else create_scheduler(weights, domain, mode=inputs.mode)
+    )
+    problems = domain.instances(inputs.scale, inputs.instances, inputs.seed)
+    scores = evaluate_scheduler(domain, scheduler, problems, settings)
+    revision = source_revision()
+    return [
+        Cell(
+            inputs=wanted,
+            M1=_rounded(m1.mean(axis=1)),
+            episode_std=round(float(np.sqrt(m1.var(axis=1).mean())), DECIMALS),
+            visible_share=round(scores.visible_share, DECIMALS),
+            needs=scores.needs,
+            training=training,
+            seconds=round(scores.seconds, 1),
+            revision=revision,
+        )
+        for wanted in (inputs, *besides)
+        for m1 in (scores.measures[wanted.objective],)
+    ]
+
+
+def _prove(inputs: Bound) -> Cell:
+    started = time.perf_counter()
+    bounds = import_module(f"marl_sched.agents.{inputs.env}.bound.relaxation")
+    problems = get_domain(inputs.env).instances(inputs.scale, inputs.instances, inputs.seed)
+    relaxation = bounds.Relaxation(problems, objective=inputs.objective, horizon=inputs.horizon)
+    found = bounds.upper_bounds(relaxation, price_vectors=inputs.price_vectors, evaluations=inputs.evaluations)
+    return Cell(
+        inputs=inputs,
+        M1=_rounded(found.value, up=True),
+        needs="failure model and clock",
+        seconds=round(time.perf_counter() - started, 1),
+        revision=source_revision(),
+    )
+
+
+def _rounded(values: np.ndarray, *, up: bool = False) -> list[float]:
+    """To six decimals; a bound is rounded up, to stay one."""
+    scale = 10**DECIMALS
+    return [float(v) for v in np.round((np.ceil if up else np.rint)(values * scale) / scale, DECIMALS)]

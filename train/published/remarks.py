@@ -1,0 +1,71 @@
+"""A few sentences below each table, worked out from its figures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from marl_sched.train.published.results import FAILURE_MODEL
+
+
+def reading_aid(table: Mapping[str, Any]) -> str:
+    """What an objective's table shows: the best rows, learned ones against rules, published ranks that do not hold."""
+    return " ".join([_best(table), _learned(table), *_above_the_bound(table), _ranks(table)])
+
+
+def _best(table: Mapping[str, Any]) -> str:
+    """Who has the highest mean on each scale, with and without the failure model."""
+    told = []
+    for scale in table["scales"]:
+        entries = [(row, row["scales"][scale]) for row in table["rows"] if "M1" in row["scales"].get(scale, {})]
+        blind = [pair for pair in entries if FAILURE_MODEL not in pair[1]["needs"]]
+        row, entry = max(blind, key=lambda pair: float(pair[1]["M1"]["mean"]))
+        told.append(
+            f"{row['label']} on {scale} ({entry['M1']['mean']:.4f}, {entry['gap_closed']:.1f} % of the gap closed)"
+        )
+    return f"Highest mean without the failure model: {_listed(told)}."
+
+
+def _learned(table: Mapping[str, Any]) -> str:
+    """Which learned rows pass the best rule by more than chance on all scales that they play."""
+    learned = {
+        row["label"]: [entry["difference"] for entry in row["scales"].values() if "M1" in entry]
+        for row in table["rows"]
+        if row["learned"]
+    }
+    learned = {label: differences for label, differences in learned.items() if differences}
+    if not learned:
+        return "No learned scheduler has played yet."
+    above = [
+        label
+        for label, differences in learned.items()
+        if all(difference["ci95"] is not None and difference["ci95"][0] > 0 for difference in differences)
+    ]
+    if not above:
+        return "No learned scheduler passes the best rule with an interval above zero on every scale that it plays."
+    return f"Learned and above the best rule, with an interval above zero on every scale played: {_listed(above)}."
+
+
+def _above_the_bound(table: Mapping[str, Any]) -> list[str]:
+    """Means that lie above the bound, which holds for expectations."""
+    above = [
+        f"{row['label']} on {scale} ({entry['M1']['mean']:.4f})"
+        for row in table["rows"]
+        for scale, entry in row["scales"].items()
+        if "M1" in entry and entry["M1"]["mean"] > table["scales"][scale]["bound"]["M1"]["mean"]
+    ]
+    return [f"Means above the bound, which binds expectations: {_listed(above)}."] if above else []
+
+
+def _ranks(table: Mapping[str, Any]) -> str:
+    found = [f"{c['lower']} is below {c['higher']} on {_listed(list(c['scales']))}" for c in table["contradictions"]]
+    if not found:
+        return "No two methods of the dissertation stand in another order here by more than chance explains."
+    return (
+        f"Of the dissertation's methods some stand here in another order than published, with a 95 percent interval "
+        f"of their paired difference that excludes zero: {'; '.join(found)}."
+    )
+
+
+def _listed(words: list[str]) -> str:
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
