@@ -83,7 +83,7 @@ def worker_processes(workers: int) -> Iterator[Executor]:
 
 def _begin_work() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process; the parent ends the workers
-    threading.Thread(action=_end_with_parent, daemon=True).start()
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     keep_freed_memory()
     if find_spec("torch") is not None:
         import torch
