@@ -21,7 +21,7 @@ import numpy as np
 from numba import njit
 
 from marl_sched.envs.murse.instance import NO_DEADLINE
-from marl_sched.noise import moment_key, uniform
+from marl_sched.noise import time_key, uniform
 
 HORIZON_LOADS = 1.3
 """The horizon of tasks without a deadline, in mean loads of an agent."""
@@ -282,7 +282,7 @@ def climb(
     share, reach = MOVED / n, REACH * common_horizon(durations)
     trial, ready = np.empty(n), np.empty_like(free)
     for evaluation in range(first, last):
-        moment = moment_key(key, evaluation)
+        moment = time_key(key, evaluation)
         for task in range(n):
             trial[task] = keys[task]
             if uniform(moment, _STREAM, task, 0) < share:
