@@ -87,6 +87,11 @@ class Telemetry(Protocol):
         """An agent's empty local state; InvalidMessageError for a frame that does not parse or lacks the agent."""
 
 
+def _none_known(instance: Any) -> list[str]:
+    """No instance of a domain that does not say otherwise is known to be impossible."""
+    return []
+
+
 @dataclass(frozen=True, kw_only=True)
 class Domain:
     """One scheduling problem as the rooms see it.
@@ -141,9 +146,17 @@ class Domain:
     reference: str | None = None
     cli_options: Mapping[str, str] = field(default_factory=dict)
     generate_accepted: Callable[[str, np.random.Generator, Callable[[Any], bool]], Any] | None = None
-    impossibilities: Callable[[Any], list[str]] = lambda instance: []
+    impossibilities: Callable[[Any], list[str]] = _none_known
     legend: Mapping[str, Sequence[int]] | None = None
     band: tuple[str, int] | None = None
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Domain:
+        """Itself: a domain never changes."""
+        return self
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """Pickled by name where it is registered, since it holds functions that cannot be pickled."""
+        return (get_domain, (self.name,)) if _DOMAINS.get(self.name) is self else super().__reduce_ex__(protocol)
 
     def agent_name(self, agent: int) -> str:
         """`crew_3` for agent 3 of a domain whose agents are crews."""

@@ -10,15 +10,31 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from marl_sched.errors import IllegalActionError
+from marl_sched.errors import IllegalActionError, InvalidOptionError
 from marl_sched.graph import ACTION_MASK, ArraySpec, GraphSpec
 from marl_sched.noise import Stream, uniforms
 
 Observation = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class SavedState:
+    """Where a simulator stands: copies, to which it can return any number of times (`TurnSimulator.load_state`).
+
+    Attributes:
+        kind: class of the simulator that saved it.
+        arrays: copies of the simulator's `live_arrays`.
+        instances: the instances being played; they never change and are not copied.
+    """
+
+    kind: str
+    arrays: Mapping[str, np.ndarray]
+    instances: tuple[Any, ...]
 
 
 class TurnSimulator(ABC):
@@ -26,6 +42,7 @@ class TurnSimulator(ABC):
 
     Attributes (all shapes with B = `batch`):
         batch: number of rows.
+        instances: the instance of each row.
         view: what acting agents see, an instance of one of the domain's views; its `kind` is the view's name.
         max_agents, max_actions: padded sizes; actions are 0..max_actions-1.
         n_agents: int64 (B,), agents of each row's instance.
@@ -41,6 +58,7 @@ class TurnSimulator(ABC):
     """
 
     batch: int
+    instances: list[Any]
     view: Any
     max_agents: int
     max_actions: int
@@ -87,6 +105,9 @@ class TurnSimulator(ABC):
 
         A negative agent gives an empty graph in which only action 0 is legal. An agent that is busy or has
         acted at this decision epoch may do nothing but action 0.
+
+        Raises InvalidOptionError for an agent from `max_agents` on and for arrays in `out` of other shapes than
+        `new_observation` makes.
         """
 
     @abstractmethod
@@ -121,6 +142,52 @@ class TurnSimulator(ABC):
     def snapshot(self, row: int) -> dict[str, np.ndarray]:
         """Copies of all arrays of one row's true state, for traces, rendering and bit-equality tests."""
 
+    def live_arrays(self) -> dict[str, np.ndarray]:
+        """The arrays in which the running episodes stand, by name: what saving copies and loading writes to.
+
+        By default every array that is an attribute or a field of the named tuple `state`. A domain that keeps its
+        state elsewhere overrides this.
+        """
+        arrays = {name: value for name, value in vars(self).items() if isinstance(value, np.ndarray)}
+        state = getattr(self, "state", None)
+        fields = getattr(state, "_fields", ())
+        return arrays | {f"state.{name}": getattr(state, name) for name in fields}
+
+    def save_state(self) -> SavedState:
+        """A copy of where every episode of the batch stands, for lookahead and tree search."""
+        arrays = {name: array.copy() for name, array in self.live_arrays().items()}
+        return SavedState(type(self).__name__, arrays, tuple(self.instances))
+
+    def load_state(self, saved: SavedState) -> None:
+        """Go back to a saved state, of this simulator or of one that was made with the same options.
+
+        Raises InvalidOptionError, and changes nothing, for a state of another kind or other sizes.
+        """
+        live = self.live_arrays()
+        expected = {name: (array.shape, array.dtype) for name, array in live.items()}
+        got = {name: (array.shape, array.dtype) for name, array in saved.arrays.items()}
+        if saved.kind != type(self).__name__ or got != expected:
+            raise InvalidOptionError(
+                f"load_state: expected a state of {type(self).__name__} with the sizes of this simulator, "
+                f"got one of {saved.kind}{_first_difference(expected, got)}"
+            )
+        for name, array in live.items():
+            np.copyto(array, saved.arrays[name])
+        self.instances[:] = saved.instances
+        self._link()
+
+    def __setstate__(self, attributes: dict[str, Any]) -> None:
+        """Finish a copy made by `copy` or `pickle`: attributes that are views of other arrays become views again."""
+        vars(self).update(attributes)
+        self._link()
+
+    def _link(self) -> None:
+        """Set what follows from the state: attributes that are views of its arrays, caches of the instances.
+
+        Called after the simulator was copied, unpickled or brought to a saved state. A domain whose attributes are
+        views overrides it: copying an array severs its views.
+        """
+
     def new_observation(self) -> Observation:
         """Zeroed arrays of an observation for this batch, to pass as `out`."""
         return {name: spec.empty(self.batch) for name, spec in self.arrays.items()}
@@ -137,3 +204,11 @@ class TurnSimulator(ABC):
     def over(self) -> np.ndarray:
         """Bool (B,), rows whose episode has ended."""
         return self.terminated | self.truncated
+
+
+def _first_difference(expected: Mapping[str, Any], got: Mapping[str, Any]) -> str:
+    """`: state.rows has shape (3,), expected (2,)` for the first array that differs, "" if none does."""
+    for name in sorted(set(expected) | set(got)):
+        if expected.get(name) != got.get(name):
+            return f": {name} is {got.get(name, 'missing')}, expected {expected.get(name, 'none')}"
+    return ""

@@ -314,8 +314,33 @@ def begin_step(row: Record) -> None:
 
 
 @njit(cache=True)
+def require_consistent(state: State, rules: Rules, batch: int) -> None:
+    """Raise ValueError where arrays do not belong together or a row does not fit into them: writing would go astray.
+
+    Compiled code does not check its indices, so every entry point that writes begins with this.
+    """
+    slots, crews, hours = state.planes.shape[1], state.crews.shape[1], state.series.shape[1]
+    fit = state.rows.shape[0] == state.planes.shape[0] == state.crews.shape[0] == state.series.shape[0] == batch
+    fit &= rules.horizon <= hours and (state.timeline.shape[0] == 0 or state.timeline.shape == (batch, hours, slots))
+    fit &= state.past.shape[0] == batch and state.past.shape[2] == slots
+    fit &= state.private_memory_at.shape == state.private_memory.shape and state.private_memory_at.shape[0] in (
+        0,
+        batch,
+    )
+    if not fit:
+        raise ValueError("the arrays of this state do not belong together")
+    for b in range(batch):
+        row = state.rows[b]
+        if row.n_planes >= slots or row.n_crews > crews or row.acting >= row.n_crews or row.time < 0:
+            raise ValueError("a row of this state does not fit into its arrays")
+        if row.time >= rules.horizon and not (row.terminated or row.truncated):
+            raise ValueError("a row of this state runs on after its horizon")
+
+
+@njit(cache=True)
 def step(state: State, rules: Rules, actions: np.ndarray) -> None:
     """Take a turn, int64 (B,), in every row that is not over and let hours pass until a crew of it is free."""
+    require_consistent(state, rules, actions.shape[0])
     for b in range(actions.shape[0]):
         row = state.rows[b]
         begin_step(row)
@@ -352,6 +377,7 @@ def play_hour(state: State, rules: Rules, choices: np.ndarray) -> None:
     This is the centralised interface of section 6.2.4: actions of busy crews are ignored, impossible ones idle
     the crew. Afterwards `acting` is the first free crew, -1 if all are busy.
     """
+    require_consistent(state, rules, choices.shape[0])
     for b in range(choices.shape[0]):
         row = state.rows[b]
         begin_step(row)

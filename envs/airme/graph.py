@@ -13,6 +13,7 @@ from numba import njit
 
 from marl_sched.envs.airme.dynamics import UNDECIDED, Record, State
 from marl_sched.envs.airme.views import EVERYWHERE, home_sector, ring_distance
+from marl_sched.errors import InvalidOptionError
 from marl_sched.graph import GraphSpec, NodeType, Relation
 
 _PLANE = (
@@ -72,6 +73,7 @@ def observe(state: State, usage: np.ndarray, agents: np.ndarray, limits: np.ndar
     `usage` float64 (n_types,). `limits` int64 (B, 3): each row's reach, comm and staleness, see
     marl_sched.envs.airme.views.
     """
+    require_fitting(state, len(usage), agents, limits, out)
     for b in range(agents.shape[0]):
         reach, comm, staleness = limits[b, 0], limits[b, 1], limits[b, 2]
         out.crew[b] = 0
@@ -91,6 +93,22 @@ def observe(state: State, usage: np.ndarray, agents: np.ndarray, limits: np.ndar
             out.plane[b] = 0
             out.plane_mask[b] = 0
             out.visible_share[b] = 0
+
+
+@njit(cache=True)
+def require_fitting(state: State, n_types: int, agents: np.ndarray, limits: np.ndarray, out: Arrays) -> None:
+    """Raise InvalidOptionError where arrays or agents do not fit: compiled code does not check its indices."""
+    batch, slots, crews = len(agents), state.planes.shape[1], state.crews.shape[1]
+    fit = state.rows.shape[0] == batch and limits.shape == (batch, 3)
+    fit &= out.plane.shape == (batch, slots, N_PLANE + n_types) and out.plane_mask.shape == (batch, slots)
+    fit &= out.crew.shape == (batch, crews, N_CREW) and out.crew_mask.shape == (batch, crews)
+    fit &= out.state.shape == (batch, N_STATE + n_types) and out.repairing.shape == (batch, crews)
+    fit &= out.action_mask.shape == (batch, slots) and out.time.shape == out.visible_share.shape == (batch,)
+    if not fit:
+        raise InvalidOptionError("out: expected arrays of the shapes that new_observation() makes")
+    for b in range(batch):
+        if agents[b] >= crews:
+            raise InvalidOptionError("agents: expected agents below max_agents")
 
 
 @njit(cache=True)

@@ -12,7 +12,7 @@ from marl_sched.envs.airme.instance import SCALES, AirmeInstance
 from marl_sched.envs.airme.views import FullView, View
 from marl_sched.errors import IllegalActionError, InvalidOptionError, require, require_integer
 from marl_sched.noise import as_seed, episode_key
-from marl_sched.simulation import Observation, TurnSimulator
+from marl_sched.simulation import Observation, SavedState, TurnSimulator
 
 DEFAULT_HORIZON = 720
 MOST_HOURS = 1_000_000  # of an episode: books are kept for every hour
@@ -75,7 +75,7 @@ class AirmeSimulator(TurnSimulator):
             horizon=horizon,
             stop_share=stop_share or 0.0,
         )
-        self._expose()
+        self._link()
         self._seeds = np.zeros(self.batch, np.int64)
         self._episodes = np.full(self.batch, -1, np.int64)
         self.reset(seed=seed)
@@ -99,12 +99,14 @@ class AirmeSimulator(TurnSimulator):
         if stop_share is not None and not 0 < stop_share <= 1:
             raise InvalidOptionError(f"stop_share: expected a share in (0, 1] or None, got {stop_share}")
 
-    def _expose(self) -> None:
+    def _link(self) -> None:
+        """Make the attributes views of the state's rows, and the failure table reach the instances' counters."""
         rows = self.state.rows
         self.n_agents, self.acting, self.time = rows["n_crews"], rows["acting"], rows["time"]
         self.reward, self.elapsed, self.conflict = rows["reward"], rows["elapsed"], rows["conflict"]
         self.terminated, self.truncated = rows["terminated"], rows["truncated"]
         self.episode_keys = rows["episode"]
+        self._cover_counters(self.instances)
 
     def reset(
         self,
@@ -172,6 +174,12 @@ class AirmeSimulator(TurnSimulator):
             state.past[b] = planes
         if len(state.private_memory_at):
             state.private_memory_at[b] = -1
+
+    def load_state(self, saved: SavedState) -> None:
+        """Go back to a saved state; see TurnSimulator.load_state. The aircraft types must be this simulator's."""
+        if any(instance.types != self.types for instance in saved.instances):
+            raise InvalidOptionError("load_state: the saved fleets have other aircraft types than this simulator's")
+        super().load_state(saved)
 
     def step(self, actions: np.ndarray) -> None:
         """Take one turn in every row; see TurnSimulator.step."""

@@ -270,8 +270,31 @@ def end_round(state: State, rules: Rules, b: int) -> None:
 
 
 @njit(cache=True)
+def require_consistent(state: State, batch: int) -> None:
+    """Raise ValueError where arrays do not belong together or a row does not fit into them: writing would go astray.
+
+    Compiled code does not check its indices, so every entry point that writes begins with this.
+    """
+    n, m, rounds = state.tasks.shape[1], state.agents.shape[1], state.rounds.shape[1]
+    fit = state.rows.shape[0] == state.tasks.shape[0] == state.agents.shape[0] == state.priors.shape[0] == batch
+    fit &= state.pairs.shape == state.base.shape == state.filters.shape == (batch, n, m)
+    fit &= state.curves.shape == (batch, n, m, 6) and state.order.shape == (batch, n)
+    fit &= state.lags.shape == state.near.shape == (batch, n, n) and state.private_memory.shape == (batch, m, n, 2)
+    fit &= state.rounds.shape[0] == batch and state.executed.shape == (batch, rounds, n)
+    if not fit:
+        raise ValueError("the arrays of this state do not belong together")
+    for b in range(batch):
+        row = state.rows[b]
+        if row.n_tasks > n or row.n_agents > m or row.n_rounds > rounds or row.acting >= row.n_agents:
+            raise ValueError("a row of this state does not fit into its arrays")
+        if row.acting != NOBODY and (row.round >= row.n_rounds or row.dispatched >= row.n_tasks):
+            raise ValueError("a row of this state runs on after its last round")
+
+
+@njit(cache=True)
 def step(state: State, rules: Rules, actions: np.ndarray) -> None:
     """Take a turn, int64 (B,), in every row that is not over, and go on to its next acting agent."""
+    require_consistent(state, len(actions))
     for b in range(len(actions)):
         row = state.rows[b]
         row.reward = 0.0
@@ -297,8 +320,14 @@ def begin_rows(state: State, rules: Rules, rows: np.ndarray) -> None:
 
 @njit(cache=True)
 def play_round(state: State, rules: Rules, b: int, tasks: np.ndarray, agents: np.ndarray) -> None:
-    """Take int64 (K,) tasks and agents as this round's whole plan in row b, then end the round."""
+    """Take int64 (K,) tasks and agents as this round's whole plan in row b, then end the round.
+
+    Raises ValueError for a row whose episode is over, and for more tasks than it has.
+    """
+    require_consistent(state, len(state.rows))
     row = state.rows[b]
+    if row.acting == NOBODY or len(tasks) > row.n_tasks or len(agents) != len(tasks):
+        raise ValueError("no round of this row can take this plan")
     before = row.time
     row.reward = 0.0
     row.conflict = False

@@ -36,6 +36,8 @@ STATE_FEATURES = (
     "unscheduled_share", "committed_share", "finished_share", "deadline_share", "mean_duration", "tasks_per_agent/10",
     "robot_share", "clock/10", "round/10",
 )  # fmt: skip
+N_TASK, N_AGENT = len(TASK_FEATURES), len(AGENT_FEATURES)
+N_LOCATION, N_STATE = len(LOCATION_FEATURES), len(STATE_FEATURES)
 
 
 def graph_spec(simplification: int) -> GraphSpec:

@@ -23,6 +23,10 @@ from marl_sched.envs.murse.graph import (
     MY_DURATION,
     MY_REPETITIONS,
     MY_SPREAD,
+    N_AGENT,
+    N_LOCATION,
+    N_STATE,
+    N_TASK,
     PLACEHOLDER,
     START,
     STD_DURATION,
@@ -38,12 +42,14 @@ from marl_sched.envs.murse.rules import Rules
 from marl_sched.envs.murse.state import NEVER, NOBODY, State
 from marl_sched.envs.murse.timetable import earliest_start
 from marl_sched.envs.murse.views import Sight, new_sight, standpoint, survey
+from marl_sched.errors import InvalidOptionError
 from marl_sched.temporal_network import UNBOUNDED, close
 
 
 @njit(cache=True, error_model="numpy")
 def observe(state: State, rules: Rules, agents: np.ndarray, sensing: float, comm: float, out: Arrays) -> None:
     """Write what each row's agent, int64 (B,), sees; a negative agent sees nothing."""
+    require_fitting(state, agents, out)
     sight = new_sight(state)
     for b in range(len(agents)):
         clear(out, b)
@@ -61,6 +67,27 @@ def observe(state: State, rules: Rules, agents: np.ndarray, sensing: float, comm
         summarise(state, b, sight, out)
         if state.agents[b, viewer].free_at <= state.rows[b].clock and state.rows[b].acting != NOBODY:
             write_action_mask(state, b, sight, out)
+
+
+@njit(cache=True)
+def require_fitting(state: State, agents: np.ndarray, out: Arrays) -> None:
+    """Raise InvalidOptionError where arrays or agents do not fit: compiled code does not check its indices."""
+    batch, n, m = len(agents), state.tasks.shape[1], state.agents.shape[1]
+    tasks, edges = (batch, n + 2), (batch, n + 2, n + 2)
+    fit = state.rows.shape[0] == batch and out.agent.shape == (batch, m, N_AGENT) and out.agent_mask.shape == (batch, m)
+    fit &= out.task.shape == (batch, n + 2, N_TASK) and out.task_mask.shape == out.action_mask.shape == tasks
+    fit &= out.assigned_to.shape == out.located_in.shape == out.decider.shape == tasks
+    fit &= out.location.shape == (batch, n, N_LOCATION) and out.location_mask.shape == (batch, n)
+    fit &= out.near.shape == (batch, n, n) and out.state.shape == (batch, N_STATE)
+    fit &= out.temporal.shape == edges and out.temporal_attributes.shape == (batch, n + 2, n + 2, 1)
+    fit &= len(out.aug) == 0 or (out.aug.shape == edges and out.aug_attributes.shape == out.temporal_attributes.shape)
+    fit &= out.take_time.shape == (batch, m, n + 2) and out.take_time_attributes.shape == (batch, m, n + 2, 2)
+    fit &= out.use_time.shape == (batch, n + 2, m) and out.use_time_attributes.shape == (batch, n + 2, m, 2)
+    if not fit or out.time.shape != (batch,) or out.visible_share.shape != (batch,):
+        raise InvalidOptionError("out: expected arrays of the shapes that new_observation() makes")
+    for b in range(batch):
+        if agents[b] >= m:
+            raise InvalidOptionError("agents: expected agents below max_agents")
 
 
 @njit(cache=True, error_model="numpy")

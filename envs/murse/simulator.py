@@ -90,7 +90,8 @@ class MurseSimulator(TurnSimulator):
         self.instances = [self._with_settings(instance) for instance in instances]
         self.batch = len(self.instances)
         self._allocate(pad, graph.SIMPLIFICATIONS.index(simplification))
-        self._loaded: list[MurseInstance | None] = [None] * self.batch
+        self._link()
+        self._loaded = [None] * self.batch
         self._seeds = np.zeros(self.batch, np.int64)
         self._episodes = np.full(self.batch, -1, np.int64)
         self.reset(seed=seed)
@@ -108,6 +109,10 @@ class MurseSimulator(TurnSimulator):
         sizes = {"task": tasks + 2, "agent": agents, "location": tasks, "decision": tasks + 2}
         self.arrays = self.graph.arrays(sizes)
         self._no_reverse = (np.zeros((0, 0, 0), np.int8), np.zeros((0, 0, 0, 0), np.float32))
+
+    def _link(self) -> None:
+        """Make the attributes views of the state's rows, which hold the data of all instances."""
+        self._loaded: list[MurseInstance | None] = list(self.instances)
         rows = self.state.rows
         self.n_agents, self.acting, self.time = rows["n_agents"], rows["acting"], rows["time"]
         self.reward, self.elapsed, self.conflict = rows["reward"], rows["elapsed"], rows["conflict"]
