@@ -33,6 +33,11 @@ class SchedulingAEC(SchedulingEnvironment, AECEnv):
     Raises InvalidOptionError for a `scheme`: every free agent has its turn here.
     """
 
+    changing = (
+        "agents", "agent_selection", "rewards", "terminations", "truncations", "infos", "_single.position",
+        "_cumulative_rewards", "_index", "_conflict", "_skip_agent_selection", "_paid", "_acting", "_seen", "_legal",
+    )  # fmt: skip
+
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
         """Start episode 0 of `seed`, or the next episode; `options={"instance": ...}` gives its instance."""
         self._single.reset(seed, options)

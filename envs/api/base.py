@@ -9,11 +9,12 @@ from gymnasium import spaces
 
 from marl_sched.domain import Domain
 from marl_sched.envs.api.episode import SingleEpisode
+from marl_sched.envs.api.saving import SavesState
 from marl_sched.envs.api.spaces import action_space, graph_space, observation_space
 from marl_sched.errors import InvalidOptionError, UnknownNameError
 
 
-class SchedulingEnvironment:
+class SchedulingEnvironment(SavesState):
     """The half of a PettingZoo environment that does not ask how agents take turns.
 
     Args:

@@ -36,6 +36,7 @@ class SingleEpisode:
 
     Attributes:
         simulator: the TurnSimulator, with B = 1.
+        position: the seed and the number of the running episode, -1 before the first reset.
         metadata: what PettingZoo and Gymnasium ask of a class.
     """
 
@@ -66,13 +67,13 @@ class SingleEpisode:
             "is_parallelizable": False,
         }
         self._fixed = None if instance is None else as_instance(self.domain, instance)
-        self._seed, self._episode = as_seed(seed), -1
+        self.position = as_seed(seed), -1
         self.simulator = self.domain.simulator(
             [self._instance(0)],
             view=self.domain.make_view(view),
             objective=self.domain.objectives[0] if objective is None else objective,
             horizon=self.domain.default_horizon if horizon is None else horizon,
-            seed=self._seed,
+            seed=self.position[0],
             pad=self.scale,
             **dict(self.domain.render_options.get(str(render_mode), {})),
             **options,
@@ -85,7 +86,7 @@ class SingleEpisode:
     def _instance(self, episode: int) -> Any:
         if self._fixed is not None:
             return self._fixed
-        return self.domain.generate(str(self.scale), np.random.default_rng([self._seed, episode]))
+        return self.domain.generate(str(self.scale), np.random.default_rng([self.position[0], episode]))
 
     def reset(self, seed: int | None, options: Mapping[str, Any] | None) -> None:
         """Start the next episode, or episode 0 of `seed`.
@@ -97,12 +98,10 @@ class SingleEpisode:
         for name in options:
             require("reset option", name, _KNOWN_OPTIONS)
         given = as_instance(self.domain, options["instance"]) if "instance" in options else None
-        if seed is not None:
-            self._seed, self._episode = as_seed(seed), 0
-        else:
-            self._episode += 1
-        instance = self._instance(self._episode) if given is None else given
-        self.simulator.reset(seed=self._seed, instances=[instance], episodes=[self._episode])
+        self.position = (as_seed(seed), 0) if seed is not None else (self.position[0], self.position[1] + 1)
+        seed, episode = self.position
+        instance = self._instance(episode) if given is None else given
+        self.simulator.reset(seed=seed, instances=[instance], episodes=[episode])
 
     @property
     def over(self) -> bool:

@@ -9,12 +9,13 @@ import numpy as np
 
 from marl_sched.domain import Domain
 from marl_sched.envs.api.episode import SingleEpisode
+from marl_sched.envs.api.saving import SavesState
 from marl_sched.envs.api.spaces import graph_space
 from marl_sched.errors import IllegalActionError, InvalidOptionError
 from marl_sched.simulation import Observation
 
 
-class SchedulingEnv(gymnasium.Env):
+class SchedulingEnv(SavesState, gymnasium.Env):
     """A domain as a Gymnasium environment with joint actions.
 
     What a joint action is and which time a step takes is the domain's (`Domain.central`): in AirME an action for
@@ -28,6 +29,8 @@ class SchedulingEnv(gymnasium.Env):
 
     Raises InvalidOptionError if a view is given.
     """
+
+    changing = ("_single.position",)
 
     # An instance variable to type checkers, as gymnasium.Env declares it; `make` reads it from the class.
     metadata: dict[str, Any] = {"render_modes": ["ansi", "rgb_array"], "render_fps": 10}  # noqa: RUF012

@@ -35,12 +35,21 @@ class SchedulingParallel(SchedulingEnvironment, ParallelEnv):
         options: as SingleEpisode takes them, its `render_mode` included.
     """
 
+    changing = ("agents", "_masks", "_single.position")
+
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observations, Infos]:
         """Start episode 0 of `seed`, or the next episode; `options={"instance": ...}` gives its instance."""
         self._single.reset(seed, options)
         self.agents = self.possible_agents[: self.simulator.n_agents[0]]
         self._masks: dict[str, np.ndarray] = {}
         return self._look(set(), set())
+
+    def observe(self, agent: str) -> dict[str, Any]:
+        """What an agent of this instance sees now, as `step` and `reset` return it; UnknownNameError for others."""
+        if agent not in self.agents:
+            raise UnknownNameError("agent", agent, self.agents)
+        seen = self._single.observe(self.agents.index(agent))
+        return {"observation": seen, ACTION_MASK: seen.pop(ACTION_MASK)}
 
     def _look(self, conflicts: set[int], illegal: set[int]) -> tuple[Observations, Infos]:
         """What every agent sees and is told; numbers of agents whose last choices failed."""

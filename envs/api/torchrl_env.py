@@ -32,6 +32,7 @@ from torchrl.envs import EnvBase
 from marl_sched.domain import Domain
 from marl_sched.envs.api.options import as_domain, as_instance
 from marl_sched.envs.api.sampling import first_illegal, random_legal
+from marl_sched.envs.api.saving import SavedEnvironment, SavesState
 from marl_sched.errors import IllegalActionError, InvalidOptionError
 from marl_sched.graph import ACTION_MASK, ArraySpec
 from marl_sched.noise import as_seed
@@ -42,7 +43,7 @@ InstanceSource = Callable[[int, int], Any]
 """(row, number of the row's episode from 0) -> the instance to play, or its file."""
 
 
-class SchedulingTorchRL(EnvBase):
+class SchedulingTorchRL(SavesState, EnvBase):
     """A batch of rows of a domain as a TorchRL environment; the module's page lists the tensordict's entries.
 
     Without `instances` and `source`, row b plays the instance drawn by `default_rng([seed, b])` in all its
@@ -63,6 +64,7 @@ class SchedulingTorchRL(EnvBase):
     """
 
     batch_locked = True
+    changing = ("_seed", "_rng", "_count", "_mask")
 
     def __init__(
         self,
@@ -120,12 +122,23 @@ class SchedulingTorchRL(EnvBase):
         self._seed = as_seed(seed)
         self._rng = np.random.default_rng(self._seed)
         self._count = np.full(self.batch_size[0], -1, np.int64)  # of each row's running episode
+        self._find_instances()
+
+    def _find_instances(self) -> None:
+        """The instances that the seed's rows play, and how rows that share one take turns in counting episodes."""
         if self._source is None:
             rows = self.batch_size[0]
             self._fixed = self._given or self.domain.instances(str(self.scale), rows, self._seed)
             self._first, self._stride = _turns([instance.identity for instance in self._fixed])
         else:
             self._first, self._stride = np.arange(self.batch_size[0]), np.full(self.batch_size[0], self.batch_size[0])
+
+    def load_state(self, saved: SavedEnvironment) -> None:
+        """Return to a saved state; see SavesState. `current` gives the tensordict with which to go on."""
+        seed = self._seed
+        super().load_state(saved)
+        if self._seed != seed:
+            self._find_instances()
 
     def _instances(self, rows: Sequence[int] | np.ndarray, count: int | np.ndarray) -> list[Any]:
         if self._source is None:
@@ -179,6 +192,10 @@ class SchedulingTorchRL(EnvBase):
             raise IllegalActionError(f"row {bad}: {agent}: action {actions[bad]} is not legal; legal: {legal}")
         simulator.step(actions)
         return self._tensordict(self._observed() | {"reward": _column(simulator.reward)})
+
+    def current(self) -> TensorDictBase:
+        """The tensordict of the present turn, as `reset` and `step` return it: where to go on after `load_state`."""
+        return self._tensordict(self._observed())
 
     def _observed(self) -> dict[str, torch.Tensor]:
         """Everything but the reward, in fresh tensors."""
