@@ -112,7 +112,8 @@ class MurseSimulator(TurnSimulator):
 
     def _link(self) -> None:
         """Make the attributes views of the state's rows, which hold the data of all instances."""
-        self._loaded: list[MurseInstance | None] = list(self.instances)
+        self._loaded: list[MurseInstance | None]
+        self._loaded = list(self.instances)
         rows = self.state.rows
         self.n_agents, self.acting, self.time = rows["n_agents"], rows["acting"], rows["time"]
         self.reward, self.elapsed, self.conflict = rows["reward"], rows["elapsed"], rows["conflict"]
