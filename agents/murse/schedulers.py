@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from marl_sched.agents.base import Scheduler
 from marl_sched.agents.murse.genetic import GeneticEdf
+from marl_sched.agents.murse.lst import LeastLatestStart, LstSearch, RobustLst
 from marl_sched.agents.murse.negotiated import Cbba, Tessi
 from marl_sched.agents.murse.optimal import ExactScheduler, RollingScheduler, is_feasible
 from marl_sched.agents.murse.rules import EdfPublished, FirstClaim, RandomRule, edf, hctf
@@ -18,6 +19,9 @@ RULES: dict[str, Callable[..., Scheduler]] = {
     "edf": edf,
     "edf-published": EdfPublished,
     "hctf": hctf,
+    "lst": LeastLatestStart,
+    "lst-robust": RobustLst,
+    "lst-search": LstSearch,
     "first-claim": FirstClaim,
     "tessi": Tessi,
     "cbba": Cbba,

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from marl_sched.agents.murse.problem import Round
+from marl_sched.agents.murse.problem import Plan, Round
 from marl_sched.envs.murse.instance import NO_DEADLINE
 from marl_sched.envs.murse.simulator import MurseSimulator
 from marl_sched.envs.murse.state import NOBODY
@@ -22,19 +22,24 @@ def as_murse(simulator: TurnSimulator) -> MurseSimulator:
     return simulator
 
 
-def estimated_round(simulator: MurseSimulator, row: int) -> Round:
-    """The whole of a row's present round on the durations that the team counts on."""
+def estimated_round(simulator: MurseSimulator, row: int, margin: float = 0.0) -> Round:
+    """The whole of a row's present round on the durations that the team counts on.
+
+    `margin` standard deviations of each duration are added to them, rounded to whole units.
+    """
     instance = simulator.instances[row]
-    planned = simulator.state.pairs["planned"][row, : instance.n_tasks, : instance.n_agents]
+    pairs = simulator.state.pairs[row, : instance.n_tasks, : instance.n_agents]
+    planned = pairs["planned"] + np.rint(margin * pairs["spread"]).astype(np.int64)
     return Round.of(instance, np.where(instance.eligible, planned, 0))
 
 
-def remaining_round(simulator: MurseSimulator, row: int) -> Round:
+def remaining_round(simulator: MurseSimulator, row: int, margin: float = 0.0) -> Round:
     """What is left of a row's round: committed tasks with their believed times, agents when they are believed free.
 
-    Nobody is free before now. A committed task has no deadline any more: nothing can be done about it.
+    Nobody is free before now. A committed task has no deadline any more: nothing can be done about it. `margin` is
+    added to the durations of open tasks, as in `estimated_round`.
     """
-    whole, state = estimated_round(simulator, row), simulator.state
+    whole, state = estimated_round(simulator, row, margin), simulator.state
     n, clock = whole.n_tasks, int(state.rows["clock"][row])
     agents = state.tasks["agent"][row, :n].copy()
     taken = np.flatnonzero(agents != NOBODY)
@@ -48,3 +53,9 @@ def remaining_round(simulator: MurseSimulator, row: int) -> Round:
     fixed[taken], deadlines[taken] = start[taken], NO_DEADLINE
     np.maximum.at(ready, agents[taken], finish[taken])
     return replace(whole, durations=durations, deadlines=deadlines, fixed=fixed, agents=agents, ready=ready)
+
+
+def as_expected(problem: Round, plan: Plan) -> bool:
+    """Whether every task that is committed to in `problem` ends when the plan has it end."""
+    taken = np.flatnonzero(problem.fixed >= 0)
+    return np.array_equal(problem.fixed[taken] + problem.durations[taken, problem.agents[taken]], plan.finishes[taken])
