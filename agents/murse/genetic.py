@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 
 from marl_sched.agents.murse.following import PlanningScheduler
@@ -23,30 +25,47 @@ class GeneticEdf(PlanningScheduler):
         for name, value in (("generations", generations), ("baselines", baselines), ("mutations", mutations)):
             if value < 1:
                 raise InvalidOptionError(f"{self.name}: {name}: expected an integer >= 1, got {value}")
-        self._options = generations, baselines, mutations
+        self.options = generations, baselines, mutations
 
     def plan(self, simulator: MurseSimulator, row: int) -> Plan:
         """The best schedule found; its randomness is that of the row's episode and round."""
         rows = simulator.state.rows
         rng = np.random.default_rng([int(rows["episode"][row]), int(rows["round"][row])])
-        return evolve(estimated_round(simulator, row), rng, *self._options)
+        return self.evolved(estimated_round(simulator, row), rng)
+
+    def evolved(self, problem: Round, rng: np.random.Generator) -> Plan:
+        """The best schedule found from EDF's."""
+        mutate = (reallocate, swap_order)
+        return evolve(problem, rng, *self.options, first=edf_schedule(problem), mutate=mutate)
 
 
-def evolve(problem: Round, rng: np.random.Generator, generations: int, baselines: int, mutations: int) -> Plan:
-    """Start from EDF; in each of `generations` add `mutations` schedules in which a task changes its agent and as
-    many in which two tasks change places, of baselines drawn at random, and keep the best `baselines`.
+Mutation = Callable[[Round, np.ndarray, np.ndarray, np.random.Generator], None]
+"""Changes an order of dispatch and its agents, int64 (N,) each, in place."""
 
-    Feasible schedules come first, then those with the smaller makespan, ties to the older one.
+
+def evolve(
+    problem: Round,
+    rng: np.random.Generator,
+    generations: int,
+    baselines: int,
+    mutations: int,
+    *,
+    first: Plan,
+    mutate: Sequence[Mutation],
+) -> Plan:
+    """The best schedule of a genetic search that starts from `first`, a whole and consistent one.
+
+    Each of `generations` adds `mutations` schedules by every way to `mutate`, of baselines drawn at random, and keeps
+    the best `baselines`. Feasible schedules come first, then those with the smaller makespan, ties to the older one.
     """
-    first = edf_schedule(problem)
     orders, agents = first.tasks[None], first.agents[None]
     costs = np.array([_cost(problem, first)])
     for _ in range(generations):
-        parents = rng.integers(len(orders), size=2 * mutations)
+        parents = rng.integers(len(orders), size=len(mutate) * mutations)
         new_orders, new_agents = orders[parents], agents[parents]
         for k in range(mutations):
-            reallocate(problem, new_orders[k], new_agents[k], rng)
-            swap_order(new_orders[mutations + k], new_agents[mutations + k], rng)
+            for way, change in enumerate(mutate):
+                change(problem, new_orders[way * mutations + k], new_agents[way * mutations + k], rng)
         _, _, makespans, feasible = time_batch(
             new_orders, new_agents, problem.durations, problem.lags, problem.near, problem.deadlines
         )
@@ -57,7 +76,7 @@ def evolve(problem: Round, rng: np.random.Generator, generations: int, baselines
         orders, agents, costs = orders[best], agents[best], costs[best]
     best_plan = timed(problem, orders[0], agents[0])
     if not best_plan.feasible:
-        return first  # the mutants may not even be consistent, EDF's order always is
+        return first  # the mutants may not even be consistent, the first order is
     by_start = np.argsort(best_plan.starts[best_plan.tasks], kind="stable")
     return timed(problem, best_plan.tasks[by_start], best_plan.agents[by_start])
 
@@ -68,7 +87,7 @@ def reallocate(problem: Round, order: np.ndarray, agents: np.ndarray, rng: np.ra
     agents[place] = rng.choice(np.flatnonzero(problem.eligible[order[place]]))
 
 
-def swap_order(order: np.ndarray, agents: np.ndarray, rng: np.random.Generator) -> None:
+def swap_order(problem: Round, order: np.ndarray, agents: np.ndarray, rng: np.random.Generator) -> None:
     """Let two pairs, drawn at random, change places in the dispatch order, int64 (N,)."""
     a, b = rng.integers(len(order), size=2)
     order[[a, b]], agents[[a, b]] = order[[b, a]], agents[[b, a]]

@@ -7,17 +7,15 @@ free agents chooses first is the simulator's picking strategy; a rule that belon
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from types import MappingProxyType
 
 import msgspec
 import numpy as np
 
-from marl_sched.agents.base import ObservationScheduler, Scheduler, best_action
+from marl_sched.agents.base import ObservationScheduler, best_action
 from marl_sched.agents.murse.list_schedule import NO_DEADLINE_PRIORITY
-from marl_sched.agents.murse.snapshot import as_murse, estimated_round
+from marl_sched.agents.murse.snapshot import as_murse
 from marl_sched.agents.murse.traffic import Traffic
 from marl_sched.envs.murse.graph import DEADLINE, EARLIEST_FINISH, EARLIEST_START, HAS_DEADLINE, WEIGHT
-from marl_sched.envs.murse.simulator import MurseSimulator
 from marl_sched.simulation import TurnSimulator
 
 Observation = Mapping[str, np.ndarray]
@@ -67,46 +65,6 @@ class RandomRule(ObservationScheduler):
         legal = legal_tasks(observation)
         rank = np.floor(uniform * legal.sum(axis=1)).astype(np.int64)
         return np.asarray((legal.cumsum(axis=1) > rank[:, None]).argmax(axis=1), np.int64)
-
-
-class EdfPublished(Scheduler):
-    """The rule that the published code calls EDF: it does not look at deadlines.
-
-    Of the tasks that can start now it takes the one with the smallest earliest finish for the chosen agent in the
-    initial network: the time that its waits alone hold it back, everybody taking their shortest, plus the agent's
-    duration. It belongs to the picking strategy `mean_unscheduled`.
-    """
-
-    name = "edf-published"
-    needs = "all durations and waits"
-    simulator_options = MappingProxyType({"picking": "mean_unscheduled"})
-
-    def __init__(self) -> None:
-        self._rounds, self._finish = np.empty(0, np.int64), np.empty((0, 0, 0))
-
-    def start(self, simulator: TurnSimulator, rows: np.ndarray) -> None:
-        """Forget the rows' initial networks."""
-        if self._finish.shape != (simulator.batch, simulator.max_agents, simulator.max_actions):
-            self._rounds = np.full(simulator.batch, -1)
-            self._finish = np.zeros((simulator.batch, simulator.max_agents, simulator.max_actions))
-        self._rounds[rows] = -1
-
-    def decide(self, simulator: TurnSimulator) -> np.ndarray:
-        """Actions int64 (B,)."""
-        observation = simulator.observe(simulator.acting)
-        self._look_at_new_rounds(as_murse(simulator))
-        now = np.asarray(observation["task"])[..., EARLIEST_START] <= 0
-        finish = self._finish[np.arange(simulator.batch), simulator.acting]
-        return best_action(-finish, legal_tasks(observation) & now)
-
-    def _look_at_new_rounds(self, simulator: MurseSimulator) -> None:
-        rounds = simulator.state.rows["round"]
-        for row in np.flatnonzero((simulator.acting >= 0) & (rounds != self._rounds)):
-            self._rounds[row] = rounds[row]
-            instance, durations = simulator.instances[row], estimated_round(simulator, int(row)).durations
-            shortest = np.where(durations > 0, durations, np.iinfo(np.int64).max).min(axis=1)
-            held = instance.earliest_finishes(durations) - shortest
-            self._finish[row, : instance.n_agents, 1 : instance.n_tasks + 1] = (held[:, None] + durations).T
 
 
 class Claim(msgspec.Struct, array_like=True, tag=True):

@@ -9,7 +9,8 @@ from marl_sched.agents.murse.genetic import GeneticEdf
 from marl_sched.agents.murse.lst import LeastLatestStart, LstSearch, RobustLst
 from marl_sched.agents.murse.negotiated import Cbba, Tessi
 from marl_sched.agents.murse.optimal import ExactScheduler, RollingScheduler, is_feasible
-from marl_sched.agents.murse.rules import EdfPublished, FirstClaim, RandomRule, edf, hctf
+from marl_sched.agents.murse.published import EdfPublished, GeneticPublished
+from marl_sched.agents.murse.rules import FirstClaim, RandomRule, edf, hctf
 from marl_sched.agents.murse.tercio import Tercio
 
 IS_FEASIBLE = is_feasible
@@ -26,6 +27,7 @@ RULES: dict[str, Callable[..., Scheduler]] = {
     "tessi": Tessi,
     "cbba": Cbba,
     "genetic-edf": GeneticEdf,
+    "genetic-published": GeneticPublished,
     "tercio": Tercio,
     "exact": ExactScheduler,
     "exact-rolling": RollingScheduler,

@@ -10,16 +10,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from marl_sched.agents.murse.exact import solve
-from marl_sched.agents.murse.genetic import GeneticEdf, evolve
+from marl_sched.agents.murse.genetic import GeneticEdf
 from marl_sched.agents.murse.list_schedule import edf_priority, edf_schedule, list_schedule
 from marl_sched.agents.murse.optimal import ExactScheduler, RollingScheduler
 from marl_sched.agents.murse.problem import Round
+from marl_sched.agents.murse.published import GeneticPublished, published_schedule
 from marl_sched.agents.murse.schedulers import RULES
 from marl_sched.agents.murse.tercio import Tercio, overload
 from marl_sched.agents.murse.windows import induced_deadlines, task_windows
 from marl_sched.agents.registry import create_scheduler
 from marl_sched.domain import get_domain
 from marl_sched.envs.airme.simulator import AirmeSimulator
+from marl_sched.envs.murse.instance import MurseInstance
 from marl_sched.envs.murse.rules import PICKING
 from marl_sched.envs.murse.simulator import MurseSimulator
 from marl_sched.errors import InvalidOptionError
@@ -92,13 +94,30 @@ def test_hctf_takes_the_costliest_task_first():
     assert np.argsort(simulator.state.executed[0, 0]["position"]).tolist() == [1, 2, 0]
 
 
-def test_the_published_rule_ignores_deadlines_and_lets_the_quickest_agent_choose_first():
-    # robot 1 is slower on average, so robot 2 chooses first: its earliest finish is task 2's, not the urgent task 1's
-    instance = problem([[9, 5], [8, 2]], deadlines=[5, -1])
+def published(instance: MurseInstance) -> tuple[list[int], list[int], bool]:
+    """Finishes by task, doers by task and whether the published rule's round was feasible."""
     simulator = finished(create_scheduler("edf-published", "murse"), [instance])
     executed = simulator.state.executed[0, 0]
-    assert executed["agent"].tolist() == [0, 1]
-    assert not simulator.round_results(0)["feasible"][0]
+    return executed["finish"].tolist(), executed["agent"].tolist(), bool(simulator.round_results(0)["feasible"][0])
+
+
+def test_the_published_rule_passes_over_an_agent_that_would_break_the_initial_network():
+    # Robot 1 comes first, as 6.5 < 12.5 on average, but with it task 1 cannot end by 5. Robot 2 takes task 1, and
+    # robot 1, asked again, task 2 at once.
+    assert published(problem([[6, 5], [7, 20]], deadlines=[5, -1])) == ([5, 7], [1, 0], True)
+
+
+def test_the_published_rule_takes_a_task_that_finishes_early_before_an_urgent_one():
+    # Robot 2 comes first; its earliest finish is task 2's, not the urgent task 1's. Robot 1 would end task 1 at 9,
+    # after 5, and is passed over; robot 2, free at 2, is not: the initial network lets it end task 1 at 5.
+    assert published(problem([[9, 5], [8, 2]], deadlines=[5, -1])) == ([7, 2], [1, 1], False)
+
+
+def test_the_published_rule_gets_stuck_where_everybody_is_passed_over():
+    # nobody can end task 1 by 4, and both tasks can start now
+    simulator = finished(create_scheduler("edf-published", "murse"), [problem([[6, 5], [7, 20]], deadlines=[4, -1])])
+    assert simulator.round_results(0)["stuck"][0]
+    assert (simulator.state.executed[0, 0]["agent"] == -1).all()
 
 
 def test_the_published_rule_ranks_by_finish_in_the_initial_network():
@@ -109,6 +128,14 @@ def test_the_published_rule_ranks_by_finish_in_the_initial_network():
     assert np.argsort(simulator.state.executed[0, 0]["position"]).tolist() == [0, 1, 2, 3]
     without = finished(create_scheduler("edf-published", "murse"), [problem([[1], [12], [1], [14]])])
     assert np.argsort(without.state.executed[0, 0]["position"]).tolist() == [0, 2, 1, 3]
+
+
+@settings(max_examples=20, deadline=None)
+@given(instances())
+def test_the_published_search_is_never_worse_than_the_published_rule(instance):
+    whole = Round.of(instance)
+    first, best = published_schedule(whole), GeneticPublished().evolved(whole, np.random.default_rng(0))
+    assert (not best.feasible, best.makespan) <= (not first.feasible, first.makespan)
 
 
 def test_claims_go_to_whoever_finishes_first_and_are_counted():
@@ -134,7 +161,7 @@ def test_the_schedule_of_a_priority_can_start_from_what_is_committed():
 @given(instances(), st.integers(0, 9))
 def test_evolution_never_loses_to_the_edf_schedule_that_it_starts_from(instance, seed):
     whole = Round.of(instance)
-    first, better = edf_schedule(whole), evolve(whole, np.random.default_rng(seed), 3, 20, 10)
+    first, better = edf_schedule(whole), GeneticEdf(3, 20, 10).evolved(whole, np.random.default_rng(seed))
     assert (not better.feasible, better.makespan) <= (not first.feasible, first.makespan)
 
 
