@@ -11,6 +11,7 @@ from marl_sched.agents.murse.auctions.agent_schedule import UNKNOWN, AgentSchedu
 from marl_sched.agents.murse.auctions.cbba import CbbaBidder
 from marl_sched.agents.murse.auctions.network import Bidder, hearing, negotiate
 from marl_sched.agents.murse.auctions.tessi import TessiBidder
+from marl_sched.agents.murse.latest_start import common_horizon, latest_starts
 from marl_sched.agents.murse.snapshot import as_murse, estimated_round
 from marl_sched.agents.murse.traffic import Traffic
 from marl_sched.agents.murse.windows import induced_deadlines
@@ -44,7 +45,7 @@ class NegotiatingScheduler(Scheduler):
         self._radius = radius
         self.traffic = Traffic()
         self._rounds = np.empty(0, np.int64)
-        self._diaries: list[list[AgentSchedule]] = []
+        self._schedules: list[list[AgentSchedule]] = []
 
     @abstractmethod
     def bidder(self, schedule: AgentSchedule, n_agents: int) -> Bidder:
@@ -58,7 +59,7 @@ class NegotiatingScheduler(Scheduler):
         """Forget what the rows' agents agreed on."""
         self.traffic.restart(as_murse(simulator), rows)
         if len(self._rounds) != simulator.batch:
-            self._rounds, self._diaries = np.full(simulator.batch, -1), [[] for _ in range(simulator.batch)]
+            self._rounds, self._schedules = np.full(simulator.batch, -1), [[] for _ in range(simulator.batch)]
         self._rounds[rows] = -1
 
     def decide(self, simulator: TurnSimulator) -> np.ndarray:
@@ -69,7 +70,7 @@ class NegotiatingScheduler(Scheduler):
             if self._rounds[row] != rounds[row]:
                 self._negotiate(murse, row)
                 self._rounds[row] = rounds[row]
-            actions[row] = next_own(murse, row, self._diaries[row][int(murse.acting[row])])
+            actions[row] = next_own(murse, row, self._schedules[row][int(murse.acting[row])])
         return actions
 
     def _negotiate(self, simulator: MurseSimulator, row: int) -> None:
@@ -84,7 +85,7 @@ class NegotiatingScheduler(Scheduler):
         hears = hearing(problem.n_agents, instance.map_width, radius)
         talk = negotiate(bidders, hears, _TURNS_PER_TASK * problem.n_tasks)
         self.traffic.add(simulator, row, talk.messages, talk.bytes)
-        self._diaries[row] = schedules
+        self._schedules[row] = schedules
 
 
 def next_own(simulator: MurseSimulator, row: int, schedule: AgentSchedule) -> int:
@@ -114,7 +115,18 @@ class Tessi(NegotiatingScheduler):
 
     def bidder(self, schedule: AgentSchedule, n_agents: int) -> Bidder:
         """A bidder of TeSSI."""
-        return TessiBidder(schedule)
+        return TessiBidder(schedule, np.zeros(len(schedule.holder), np.int64))
+
+
+class TessiSlack(NegotiatingScheduler):
+    """TeSSI in which agents bid on the task of the least latest start first, as the rule `lst` ranks them."""
+
+    name = "tessi-slack"
+
+    def bidder(self, schedule: AgentSchedule, n_agents: int) -> Bidder:
+        """A bidder of TeSSI who knows the latest starts."""
+        keys = latest_starts(schedule.durations, schedule.lags, schedule.deadlines, common_horizon(schedule.durations))
+        return TessiBidder(schedule, np.floor(keys).astype(np.int64))
 
 
 class Cbba(NegotiatingScheduler):

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from marl_sched.agents.base import Scheduler
 from marl_sched.agents.murse.genetic import GeneticEdf
 from marl_sched.agents.murse.lst import LeastLatestStart, LstSearch, RobustLst
-from marl_sched.agents.murse.negotiated import Cbba, Tessi
+from marl_sched.agents.murse.negotiated import Cbba, Tessi, TessiSlack
 from marl_sched.agents.murse.optimal import ExactScheduler, RollingScheduler, is_feasible
 from marl_sched.agents.murse.published import EdfPublished, GeneticPublished
 from marl_sched.agents.murse.rules import FirstClaim, RandomRule, edf, hctf
@@ -25,6 +25,7 @@ RULES: dict[str, Callable[..., Scheduler]] = {
     "lst-search": LstSearch,
     "first-claim": FirstClaim,
     "tessi": Tessi,
+    "tessi-slack": TessiSlack,
     "cbba": Cbba,
     "genetic-edf": GeneticEdf,
     "genetic-published": GeneticPublished,

@@ -7,8 +7,8 @@ higher than the bids before it in the bundle, which the algorithm needs to come 
 
 Where this differs from the paper: tasks that wait for others are shared out in waves, each wave when all that it
 waits for is settled, as the paper knows no waits between agents. Near tasks of one wave do not count in bids;
-when a wave is settled everybody puts them in order of their starts. A task that no network has room for gives
-up its deadline and is bid on below all others.
+when a wave is settled everybody puts them in the one of four orders that is the least late. A task that no network
+has room for gives up its deadline and is bid on below all others.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from marl_sched.errors import InvalidMessageError
 _NOBODY = -1
 _BEST = 1e9  # a bid is this less the end of work, so that an earlier end bids higher
 _NO_BID = -1e18
+_NEVER = 1 << 40  # the deadline of a task without one
 _EXCHANGES_PER_TASK = 8  # of a wave, for each agent; more are never seen, but a wave must end
 
 
@@ -36,6 +37,7 @@ class CbbaBidder(Bidder):
         n = len(schedule.holder)
         self.schedule, self._n_agents = schedule, n_agents
         self._waves = waves(schedule.lags)
+        self._deadlines = schedule.deadlines.copy()
         self._turn = self._exchanges = 0
         self._winners, self._bids = np.full(n, _NOBODY), np.full(n, _NO_BID)
         self._starts, self._finishes = np.full(n, UNKNOWN), np.full(n, UNKNOWN)
@@ -184,19 +186,35 @@ class CbbaBidder(Bidder):
             if self._winners[task] != _NOBODY:
                 schedule.holder[task] = self._winners[task]
                 schedule.starts[task], schedule.finishes[task] = self._starts[task], self._finishes[task]
-        put_in_order(schedule, self._n_agents)
+        put_in_order(schedule, self._n_agents, self._deadlines)
         self._bundle, self._path, self._late = [], [], set()
         self._exchanges = self._quiet = 0
 
 
-def put_in_order(schedule: AgentSchedule, n_agents: int) -> None:
-    """Time all tasks that are taken anew, in order of their promised starts, so that near ones do not overlap."""
+def put_in_order(schedule: AgentSchedule, n_agents: int, deadlines: np.ndarray) -> None:
+    """Time all tasks that are taken anew, in one order for all, so that near ones do not overlap.
+
+    Of four orders that everybody can tell from what it knows (by promised start, by promised finish, by the latest
+    start that its deadline, int64 (N,), leaves a task, and by deadline) the one of the least sum of lateness
+    counts, then of the earliest end, then the first.
+    """
     taken = np.flatnonzero(schedule.holder != _NOBODY)
-    order = taken[np.argsort(schedule.starts[taken], kind="stable")]
-    lasts = np.zeros((len(schedule.holder), n_agents), np.int64)
-    lasts[taken, schedule.holder[taken]] = (schedule.finishes - schedule.starts)[taken]
-    starts, finishes = schedule.starts.copy(), schedule.finishes.copy()
-    if time_order(order, schedule.holder[order], lasts, schedule.lags, schedule.near, starts, finishes):
+    lasts = schedule.finishes - schedule.starts
+    due = np.where(deadlines == NO_DEADLINE, _NEVER, deadlines)
+    durations = np.zeros((len(schedule.holder), n_agents), np.int64)
+    durations[taken, schedule.holder[taken]] = lasts[taken]
+    best: tuple[tuple[int, int], np.ndarray, np.ndarray, np.ndarray] | None = None
+    for key in (schedule.starts, schedule.finishes, due - lasts, due):
+        order = taken[np.lexsort((taken, schedule.starts[taken], key[taken]))]
+        starts, finishes = schedule.starts.copy(), schedule.finishes.copy()
+        if not time_order(order, schedule.holder[order], durations, schedule.lags, schedule.near, starts, finishes):
+            continue
+        late = int(np.maximum(finishes - due, 0)[taken].sum())
+        found = (late, int(finishes[taken].max(initial=0)))
+        if best is None or found < best[0]:
+            best = found, order, starts, finishes
+    if best is not None:
+        _, order, starts, finishes = best
         for agent in range(n_agents):
             own = [(int(i), int(starts[i]), int(finishes[i])) for i in order if schedule.holder[i] == agent]
             schedule.note(agent, own)

@@ -15,6 +15,7 @@ class Offer(msgspec.Struct, array_like=True, tag="offer", frozen=True):
         turn: number of the auction.
         task: the task, counted from 0, or -1 if the agent bids on nothing.
         late: whether the bid breaks a deadline or a promise; any other bid beats it.
+        urgency: what ranks bids before their costs, lowest first.
         cost: when the agent would end its work.
         timetable: (task, start, finish) of all its tasks, the new one included.
     """
@@ -23,6 +24,7 @@ class Offer(msgspec.Struct, array_like=True, tag="offer", frozen=True):
     turn: int
     task: int
     late: bool
+    urgency: int
     cost: int
     timetable: list[tuple[int, int, int]]
 

@@ -5,9 +5,14 @@ permitting, and the lowest bid of all wins. Tasks come up once all that they wai
 report to an auctioneer; here there is none: everybody names the winner from the bids heard, so that agents
 that do not hear each other may both believe to have won a task. And the paper leaves out a task that fits
 nobody's network; here its deadline is given up and the task goes behind all others of the earliest bidder.
+
+In the paper only the end of work counts. Bidders may be given an urgency of every task, which everybody knows; bids
+on more urgent tasks then come first, and the end of work decides who gets the task.
 """
 
 from __future__ import annotations
+
+import numpy as np
 
 from marl_sched.agents.murse.auctions.agent_schedule import AgentSchedule
 from marl_sched.agents.murse.auctions.messages import Offer, decode, encode
@@ -19,10 +24,13 @@ _NOTHING = -1
 
 
 class TessiBidder(Bidder):
-    """One agent's side of the auctions; `schedule` holds their outcome."""
+    """One agent's side of the auctions; `schedule` holds their outcome.
 
-    def __init__(self, schedule: AgentSchedule) -> None:
-        self.schedule = schedule
+    `urgency` int64 (N,) ranks bids before their costs, lowest first; zeros as in the paper.
+    """
+
+    def __init__(self, schedule: AgentSchedule, urgency: np.ndarray) -> None:
+        self.schedule, self._urgency = schedule, urgency
         self._turn = 0
         self._offers: list[Offer] = []
         self._over = False
@@ -52,24 +60,25 @@ class TessiBidder(Bidder):
         if not bids:
             self._over = True
             return
-        winner = min(bids, key=lambda offer: (offer.late, offer.cost, offer.task, offer.agent))
+        winner = min(bids, key=lambda bid: (bid.late, bid.urgency, bid.cost, bid.task, bid.agent))
         if winner.late:
             self.schedule.deadlines[winner.task] = NO_DEADLINE
         self.schedule.note(winner.agent, winner.timetable)
 
     def _best_offer(self) -> Offer:
         schedule = self.schedule
-        best: tuple[bool, int, int, int] | None = None
+        best: tuple[bool, int, int, int, int] | None = None
         for task in range(len(schedule.holder)):
             if schedule.holder[task] != _NOTHING or not schedule.ready(task):
                 continue
             place, cost, end = schedule.place(task)
-            bid = (False, cost, end, task) if place >= 0 else (True, schedule.end_of(task), 0, task)
+            urgency = int(self._urgency[task])
+            bid = (False, urgency, cost, end, task) if place >= 0 else (True, urgency, schedule.end_of(task), 0, task)
             best = bid if best is None else min(best, bid)
         if best is None:
-            return Offer(schedule.agent, self._turn, _NOTHING, False, 0, [])
-        late, cost, _, task = best
-        return Offer(schedule.agent, self._turn, task, late, cost, self._timetable(task, late, cost))
+            return Offer(schedule.agent, self._turn, _NOTHING, False, 0, 0, [])
+        late, urgency, cost, _, task = best
+        return Offer(schedule.agent, self._turn, task, late, urgency, cost, self._timetable(task, late, cost))
 
     def _timetable(self, task: int, late: bool, cost: int) -> list[tuple[int, int, int]]:
         schedule = self.schedule

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from marl_sched.agents.murse.auctions.agent_schedule import UNKNOWN, AgentSchedule
-from marl_sched.agents.murse.auctions.cbba import CbbaBidder, waves
+from marl_sched.agents.murse.auctions.cbba import CbbaBidder, put_in_order, waves
 from marl_sched.agents.murse.auctions.consensus import LEAVE, RESET, UPDATE, resolve
 from marl_sched.agents.murse.auctions.messages import Consensus, Offer, decode, encode
 from marl_sched.agents.murse.auctions.network import Bidder, Talk, hearing, negotiate
@@ -23,17 +23,27 @@ from marl_sched.errors import InvalidMessageError
 from tests.agents.murse.playing import finished
 from tests.murse.problems import instances, problem
 
-SIDES = {"tessi": lambda schedule, n: TessiBidder(schedule), "cbba": CbbaBidder}
+
+def by_index(schedule: AgentSchedule, n_agents: int) -> TessiBidder:
+    """A bidder to whom later tasks are more urgent."""
+    return TessiBidder(schedule, -np.arange(len(schedule.holder)))
+
+
+SIDES = {
+    "tessi": lambda schedule, n: TessiBidder(schedule, np.zeros(len(schedule.holder), np.int64)),
+    "urgent": by_index,
+    "cbba": CbbaBidder,
+}
 sides = pytest.mark.parametrize("side", SIDES)
 
 
-def diaries_of(instance: MurseInstance) -> list[AgentSchedule]:
+def schedules_of(instance: MurseInstance) -> list[AgentSchedule]:
     whole = Round.of(instance)
     return [AgentSchedule(a, whole.durations, whole.lags, whole.near, whole.deadlines) for a in range(whole.n_agents)]
 
 
 def negotiated(instance: MurseInstance, side: str, hears: np.ndarray | None = None) -> tuple[list[AgentSchedule], Talk]:
-    schedules = diaries_of(instance)
+    schedules = schedules_of(instance)
     bidders: list[Bidder] = [SIDES[side](schedule, len(schedules)) for schedule in schedules]
     everybody = np.ones((len(schedules), len(schedules)), bool)
     talk = negotiate(bidders, everybody if hears is None else hears, 10_000)
@@ -92,6 +102,26 @@ def test_each_single_item_goes_to_the_agent_that_would_end_its_work_first():
     assert (talk.turns, talk.messages) == (3, 6)  # in the third turn nobody bids
 
 
+def test_the_most_urgent_task_is_auctioned_first_and_goes_to_who_would_end_first():
+    # to these bidders task 2 is the more urgent: robot 2 would end it at 3 and wins, then task 1 goes to robot 1 at 4
+    schedules, _ = negotiated(problem([[4, 5], [7, 3]]), "urgent")
+    assert [schedule.path for schedule in schedules] == [[0], [1]]
+    # by the end of work alone robot 2 wins task 2 first as well, but with 6 instead of 3 task 1 comes first
+    for side, first in (("urgent", 1), ("tessi", 0)):
+        schedule = schedules_of(problem([[4], [6]]))[0]
+        assert decode(SIDES[side](schedule, 1).speak()).task == first
+
+
+def test_a_settled_wave_is_put_in_the_order_of_the_least_lateness():
+    # Near tasks of two agents: task 1 is promised from 0 to 5, task 2 from 1 to 4 and due at 4. In the order of
+    # promised starts task 2 would end at 5 + 3 = 8, 4 too late; by promised finish it goes first and nothing is late.
+    schedule = schedules_of(problem([[5, 0], [0, 3]], locations=[[1, 1], [1, 1]], deadlines=[-1, 4]))[0]
+    schedule.note(0, [(0, 0, 5)])
+    schedule.note(1, [(1, 1, 4)])
+    put_in_order(schedule, 2, schedule.deadlines)
+    assert (schedule.starts.tolist(), schedule.finishes.tolist()) == ([3, 0], [8, 3])
+
+
 def test_a_task_is_inserted_where_its_deadline_demands():
     # task 1 lasts 4 and is won first for want of a rival; task 2 is due at 9 but task 3, of 6 units, is due at 6
     schedules, _ = negotiated(problem([[4], [9], [6]], deadlines=[-1, -1, 6]), "tessi")
@@ -112,7 +142,7 @@ def test_tasks_come_in_waves_by_what_they_wait_for():
 
 
 def test_bundles_lose_what_was_added_after_a_lost_task():
-    schedule = diaries_of(problem([[2, 1], [3, 30], [4, 40]]))[0]
+    schedule = schedules_of(problem([[2, 1], [3, 30], [4, 40]]))[0]
     bidder = CbbaBidder(schedule, 2)
     mine = decode(bidder.speak())
     assert mine.winners == [0, 0, 0]
@@ -154,12 +184,12 @@ def test_beliefs_are_settled_by_the_table_of_the_paper(mine, theirs, my_bid, the
 
 
 def test_messages_come_back_as_they_were_sent_and_others_are_refused():
-    offer = Offer(1, 4, 2, False, 30, [(2, 10, 30)])
+    offer = Offer(1, 4, 2, False, 0, 30, [(2, 10, 30)])
     assert decode(encode(offer)) == offer
     for payload in (b"", b"\xc1", msgspec.msgpack.encode(["claim", 1]), encode(offer)[:-1]):
         with pytest.raises(InvalidMessageError):
             decode(payload)
-    schedule = diaries_of(problem([[1]]))[0]
+    schedule = schedules_of(problem([[1]]))[0]
     with pytest.raises(InvalidMessageError, match="expected a consensus message"):
         CbbaBidder(schedule, 1).hear(encode(offer))
 
