@@ -282,11 +282,11 @@ def climb(
     share, reach = MOVED / n, REACH * common_horizon(durations)
     trial, ready = np.empty(n), np.empty_like(free)
     for evaluation in range(first, last):
-        moment = time_key(key, evaluation)
+        drawn = time_key(key, evaluation)
         for task in range(n):
             trial[task] = keys[task]
-            if uniform(moment, _STREAM, task, 0) < share:
-                trial[task] += reach * (2.0 * uniform(moment, _STREAM, task, 1) - 1.0)
+            if uniform(drawn, _STREAM, task, 0) < share:
+                trial[task] += reach * (2.0 * uniform(drawn, _STREAM, task, 1) - 1.0)
         ready[:] = free
         complete(durations, waiting, near, trial, ready, order, count, doers, start, finish)
         found = cost(finish, deadlines, weights, objective)
