@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from enum import Flag, auto
 from types import MappingProxyType
 from typing import Any
 
@@ -19,20 +20,46 @@ from marl_sched.graph import ACTION_MASK
 from marl_sched.simulation import TurnSimulator
 
 
+class PrivilegedInfo(Flag):
+    """What a scheduler knows beyond the acting agent's observation; `str` gives it in words for results."""
+
+    NONE = 0
+    FAILURE_MODEL = auto()
+    TIME_LEFT = auto()
+    DURATIONS = auto()
+    WAITS = auto()
+    DEADLINES = auto()
+    PLACES = auto()
+
+    def __str__(self) -> str:
+        """The parts in words, such as "failure model and clock"; "" for nothing."""
+        *first, last = [_IN_WORDS[part] for part in self] or [""]
+        return f"{', '.join(first)} and {last}" if first else last
+
+
+_IN_WORDS = {
+    PrivilegedInfo.FAILURE_MODEL: "failure model",
+    PrivilegedInfo.TIME_LEFT: "clock",
+    PrivilegedInfo.DURATIONS: "all durations",
+    PrivilegedInfo.WAITS: "waits",
+    PrivilegedInfo.DEADLINES: "deadlines",
+    PrivilegedInfo.PLACES: "places",
+}
+
+
 class Scheduler(ABC):
     """Chooses actions for acting agents.
 
     Attributes:
         name: as users type it.
-        needs: what it uses beyond the acting agent's observation, in words, or "" for nothing;
-            printed with every result (for example "failure model").
+        privileged_info: what it uses beyond the acting agent's observation; printed with every result.
         simulator_options: options of the simulator that belong to it, where a user does not choose others.
         heeds_objective: whether its choices may depend on the simulator's objective; if not, one episode gives its
             scores for every objective.
     """
 
     name: str
-    needs: str = ""
+    privileged_info: PrivilegedInfo = PrivilegedInfo.NONE
     simulator_options: Mapping[str, Any] = MappingProxyType({})
     heeds_objective: bool = True
 

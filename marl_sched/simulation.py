@@ -43,7 +43,8 @@ class TurnSimulator(ABC):
     Attributes (all shapes with B = `batch`):
         batch: number of rows.
         instances: the instance of each row.
-        view: what acting agents see, an instance of one of the domain's views; its `kind` is the view's name.
+        view: what acting agents see, an instance of one of the domain's views; its `kind` is the view's name;
+            its `hides` says whether there is anything that some agent does not see.
         max_agents, max_actions: padded sizes; actions are 0..max_actions-1.
         n_agents: int64 (B,), agents of each row's instance.
         acting: int64 (B,), the agent to act, -1 where nobody is to act because the episode is over.

@@ -20,7 +20,7 @@ def generalised_advantages(
     alive: Tensor,
     *,
     discount: float,
-    trace: float,
+    gae_lambda: float,
 ) -> tuple[Tensor, Tensor]:
     """Generalised advantage estimates (Schulman et al. 2016) and value targets, float64 (T, B).
 
@@ -32,7 +32,7 @@ def generalised_advantages(
         alive: bool (T + 1, B), the state has a future: its value counts even where no turn was taken in it,
             as at the cut of an episode that could have gone on.
         discount: gamma, per unit of simulated time.
-        trace: lambda, per unit of simulated time: how far credit reaches does not depend on how many agents
+        gae_lambda: lambda, per unit of simulated time: how far credit reaches does not depend on how many agents
             act at a decision epoch.
     """
     taken = valid[:-1]
@@ -40,7 +40,7 @@ def generalised_advantages(
     values = torch.where(alive, values.double(), 0.0)
     advantages, targets = generalized_advantage_estimate(
         gamma=discount**passed,
-        lmbda=trace**passed,
+        lmbda=gae_lambda**passed,
         state_value=values[:-1],
         next_state_value=values[1:],
         reward=torch.where(taken, rewards.double(), 0.0),
@@ -59,7 +59,7 @@ def own_turn_advantages(
     alive: Tensor,
     *,
     discount: float,
-    trace: float,
+    gae_lambda: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Generalised advantage estimates along each agent's own turns, as independent learners have them (IPPO).
 
@@ -79,7 +79,7 @@ def own_turn_advantages(
     rows, owner = torch.arange(batch), agents.clamp(min=0)
     values = torch.where(alive, values.double(), 0.0)
     advantages, targets = torch.zeros(2, turns, batch, dtype=torch.float64)
-    counted = torch.zeros(turns, batch, dtype=torch.bool)
+    loss_mask = torch.zeros(turns, batch, dtype=torch.bool)
     # of each agent, (B, A): its next own turn's value and advantage, what is earned and how long it takes until then
     following, credit, earned, passed = torch.zeros(4, batch, int(owner.max()) + 1, dtype=torch.float64)
     known = torch.zeros_like(following, dtype=torch.bool)  # that value is known; an end's is 0
@@ -93,17 +93,17 @@ def own_turn_advantages(
             span = torch.where(taken, elapsed[t].double(), 0.0)[:, None]
             earned = torch.where(taken, rewards[t].double(), 0.0)[:, None] + discount**span * earned
             passed = passed + span
-            counted[t] = taken & known[rows, who]
+            loss_mask[t] = taken & known[rows, who]
             discounted = discount ** passed[rows, who]
             target = earned[rows, who] + discounted * following[rows, who]
-            target = target + discounted * trace ** passed[rows, who] * credit[rows, who]
-            advantages[t] = torch.where(counted[t], target - values[t], 0.0)
-            targets[t] = torch.where(counted[t], target, 0.0)
+            target = target + discounted * gae_lambda ** passed[rows, who] * credit[rows, who]
+            advantages[t] = torch.where(loss_mask[t], target - values[t], 0.0)
+            targets[t] = torch.where(loss_mask[t], target, 0.0)
             credit[rows, who] = advantages[t]
         following[rows, who] = values[t]
         known[rows, who] |= taken | alive[t]
         earned[rows, who] = passed[rows, who] = 0.0
-    return advantages, targets, counted
+    return advantages, targets, loss_mask
 
 
 def returns_by_time(
@@ -148,6 +148,6 @@ def step_baseline_advantages(
 
 def normalised(advantages: Tensor, valid: Tensor) -> Tensor:
     """Advantages (T, B) with mean 0 and standard deviation 1 over the valid turns, 0 elsewhere."""
-    counted = advantages[valid]
-    scaled = (advantages - counted.mean()) / (counted.std(correction=0) + 1e-8)
+    loss_mask = advantages[valid]
+    scaled = (advantages - loss_mask.mean()) / (loss_mask.std(correction=0) + 1e-8)
     return torch.where(valid, scaled, 0.0)

@@ -31,6 +31,15 @@ from marl_sched.train.device import DeviceName
 # Arguments of every domain's simulator that other keys of the configuration, or the trainer, decide on.
 _SET_ELSEWHERE = {"instances", "view", "objective", "horizon", "seed", "pad"}
 
+# Options that had another name before version 0.2.0, at the end of their path: old name -> new name.
+RENAMED = {
+    "trace": "gae_lambda",
+    "centred": "reward_centering",
+    "critic_alone": "critic_warmup",
+    "keep_least": "min_keep_prob",
+    "max_gradient": "max_grad_norm",
+}
+
 Count = Annotated[int, Meta(ge=1)]
 Natural = Annotated[int, Meta(ge=0)]
 Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]  # what marl_sched.noise takes
@@ -81,7 +90,7 @@ class PpoConfig(_Config, frozen=True, kw_only=True):
     """Clipped surrogate optimisation (equation 6.8); learning rate and entropy bonus change linearly.
 
     A run that starts from a trained policy must not unlearn it by the errors of a new critic: for the share
-    `critic_alone` of its updates the policy stays as it is, and then learns `policy_rate` times as fast as the critic.
+    `critic_warmup` of its updates the policy stays as it is, and then learns `policy_rate` times as fast as the critic.
     """
 
     clip: Positive
@@ -91,9 +100,9 @@ class PpoConfig(_Config, frozen=True, kw_only=True):
     final_learning_rate: NonNegative
     entropy: NonNegative
     final_entropy: NonNegative
-    max_gradient: Positive
-    keep_least: Annotated[float, Meta(gt=0, le=1)]
-    critic_alone: Annotated[float, Meta(ge=0, lt=1)] = 0.0
+    max_grad_norm: Positive
+    min_keep_prob: Annotated[float, Meta(gt=0, le=1)]
+    critic_warmup: Annotated[float, Meta(ge=0, lt=1)] = 0.0
     policy_rate: Positive = 1.0
 
 
@@ -103,8 +112,8 @@ class _CriticConfig(_Config, frozen=True, kw_only=True):
     instances: Count
     turns: Count
     discount: Share
-    trace: Share
-    centred: bool
+    gae_lambda: Share
+    reward_centering: bool
     critic: HetGATConfig
     ppo: PpoConfig
 
@@ -154,8 +163,8 @@ class ImitationConfig(_Config, frozen=True, kw_only=True, tag_field="name", tag=
     final_learning_rate: NonNegative
     temperature: Positive
     final_temperature: Positive
-    max_gradient: Positive
-    keep_least: Annotated[float, Meta(gt=0, le=1)]
+    max_grad_norm: Positive
+    min_keep_prob: Annotated[float, Meta(gt=0, le=1)]
 
 
 class CurriculumConfig(_Config, frozen=True, kw_only=True):
@@ -251,12 +260,16 @@ def load_config(overrides: Sequence[str]) -> TrainConfig:
     Raises InvalidOptionError for an override that Hydra cannot apply, an unknown key or a bad value, and
     UnknownNameError for a domain, scale, objective or view that is not registered.
     """
+    for override in overrides:
+        path = override.partition("=")[0].lstrip("+~")
+        _refuse_renamed(path.split("."))
     GlobalHydra.instance().clear()
     try:
         with initialize_config_module("marl_sched.configs", version_base="1.3"):
             composed = OmegaConf.to_container(compose("train", list(overrides)), resolve=True)
     except (HydraException, OmegaConfBaseException) as error:
         raise InvalidOptionError(f"train: {_one_line(error)}") from error
+    _refuse_renamed_in(composed)
     try:
         config = msgspec.convert(composed, TrainConfig)
     except msgspec.ValidationError as error:
@@ -274,7 +287,10 @@ def load_record(path: Path) -> RunRecord:
         case {"config": {"policy": dict() as policy}}:
             policy.setdefault("name", "hetgat")
     try:
+        _refuse_renamed_in(content)
         record = msgspec.convert(content, RunRecord)
+    except InvalidOptionError as error:
+        raise InvalidFileError(path, "config", f"options of this version ({error})") from error
     except msgspec.ValidationError as error:
         raise InvalidFileError(path, "", f"the record of a training run: {error}") from error
     _checked(record.config)
@@ -302,6 +318,20 @@ def _checked(config: TrainConfig) -> TrainConfig:
             )
     config.make_view()
     return config
+
+
+def _refuse_renamed(path: Sequence[str]) -> None:
+    """Raise InvalidOptionError that gives the new name of an option that was renamed; `path` is its keys."""
+    if path[-1] in RENAMED:
+        new = ".".join([*path[:-1], RENAMED[path[-1]]])
+        raise InvalidOptionError(f"train: {'.'.join(path)} was renamed: expected {new}")
+
+
+def _refuse_renamed_in(content: Any, path: tuple[str, ...] = ()) -> None:
+    """Raise InvalidOptionError for the first renamed option in nested mappings."""
+    for key, value in content.items() if isinstance(content, dict) else ():
+        _refuse_renamed([*path, key])
+        _refuse_renamed_in(value, (*path, key))
 
 
 def _one_line(error: Exception) -> str:

@@ -23,13 +23,13 @@ class Estimate:
         advantages: float64 (T, B).
         value_targets: float64 (T, B), None without a critic.
         explained_variance: how much of the targets' variance the critic explains.
-        counted: bool (T, B), turns to learn from, all of them valid.
+        loss_mask: bool (T, B), turns to learn from, all of them valid.
     """
 
     advantages: Tensor
     value_targets: Tensor | None
     explained_variance: float
-    counted: Tensor
+    loss_mask: Tensor
 
 
 class Estimator(Protocol):
@@ -50,23 +50,28 @@ class CriticEstimator:
 
     The average reward rate is subtracted from rewards ("reward centring"; Naik et al. 2024), so that values
     say how much better than usual a state is, a few units, and not what a hundred hours are worth. In a
-    problem whose episodes end by themselves that would change what is best; there `centred` must be False.
+    problem whose episodes end by themselves that would change what is best; there `reward_centering` must be False.
     """
 
-    def __init__(self, critic: nn.Module, *, discount: float, trace: float, centred: bool) -> None:
-        self._critic, self._discount, self._trace, self._centred = critic, discount, trace, centred
+    def __init__(self, critic: nn.Module, *, discount: float, gae_lambda: float, reward_centering: bool) -> None:
+        self._critic, self._discount, self._gae_lambda, self._reward_centering = (
+            critic,
+            discount,
+            gae_lambda,
+            reward_centering,
+        )
         self._rate: float | None = None
 
     def estimate(self, rollout: Rollout) -> Estimate:
         """Advantages and value targets."""
         rate = 0.0
-        if self._centred:
+        if self._reward_centering:
             seen = rollout.reward_rate
             rate = seen if self._rate is None else self._rate + _RATE_STEP * (seen - self._rate)
             self._rate = rate
         values = values_of(self._critic, rollout)
-        advantages, targets, counted = self._credit(rollout, rollout.rewards - rate * rollout.elapsed, values)
-        return Estimate(advantages, targets, explained_variance(targets, values[:-1], counted), counted)
+        advantages, targets, loss_mask = self._credit(rollout, rollout.rewards - rate * rollout.elapsed, values)
+        return Estimate(advantages, targets, explained_variance(targets, values[:-1], loss_mask), loss_mask)
 
     def _credit(self, rollout: Rollout, rewards: Tensor, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Advantages, value targets and the turns to learn from, (T, B) each."""
@@ -77,7 +82,7 @@ class CriticEstimator:
             rollout.valid,
             rollout.alive,
             discount=self._discount,
-            trace=self._trace,
+            gae_lambda=self._gae_lambda,
         )
         return advantages, targets, rollout.valid[:-1]
 
@@ -105,7 +110,7 @@ class OwnTurns(CriticEstimator):
             rollout.valid,
             rollout.alive,
             discount=self._discount,
-            trace=self._trace,
+            gae_lambda=self._gae_lambda,
         )
 
 
@@ -136,15 +141,15 @@ class StepBaseline:
         """Nothing."""
 
 
-def explained_variance(targets: Tensor, values: Tensor, counted: Tensor) -> float:
-    """Share of the variance of value targets that values explain, over the `counted` turns; all (T, B).
+def explained_variance(targets: Tensor, values: Tensor, loss_mask: Tensor) -> float:
+    """Share of the variance of value targets that values explain, over the turns of `loss_mask`; all (T, B).
 
-    0 where no turn is counted, of which there is nothing to explain.
+    0 where no turn is in it, of which there is nothing to explain.
     """
-    if not counted.any():
+    if not loss_mask.any():
         return 0.0
-    residual = (targets - values)[counted].var(correction=0)
-    return float(1 - residual / targets[counted].var(correction=0).clamp(min=1e-12))
+    residual = (targets - values)[loss_mask].var(correction=0)
+    return float(1 - residual / targets[loss_mask].var(correction=0).clamp(min=1e-12))
 
 
 @torch.inference_mode()

@@ -55,8 +55,10 @@ def knowledge(record: RunRecord) -> str:
     used = record.start.knowledge.split(", ") if record.start is not None and record.start.knowledge else []
     if isinstance(config.algorithm, ImitationConfig):
         teacher = create_scheduler(config.algorithm.teacher, config.env.name)
-        used.append(f"imitation of {teacher.name}" + (f" ({teacher.needs})" if teacher.needs else ""))
-    local = config.view["kind"] != "full"
+        used.append(
+            f"imitation of {teacher.name}" + (f" ({teacher.privileged_info})" if teacher.privileged_info else "")
+        )
+    local = config.make_view().hides
     if isinstance(config.algorithm, GaeConfig) and local:
         used.append("a critic on the full graph")
     if isinstance(config.algorithm, StateValueConfig):

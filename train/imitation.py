@@ -26,7 +26,7 @@ from marl_sched.graph import ACTION_MASK
 from marl_sched.train.collect import Rollout
 from marl_sched.train.config import ImitationConfig
 from marl_sched.train.device import device_of
-from marl_sched.train.ppo import between, means, minibatches, thinned
+from marl_sched.train.ppo import between, importance_subsample, means, minibatches
 
 LEAST = -10.0  # no choice counts as worse than this, in units of what the best choice is usually worth
 
@@ -64,7 +64,9 @@ class Imitation:
         return dict(zip(names, means(reports), strict=True))
 
     def _samples(self, rollout: Rollout, rng: np.random.Generator) -> TensorDict:
-        samples, names, rows = thinned(self.policy, rollout, rollout.valid[:-1], self._config.keep_least, rng)
+        samples, names, rows = importance_subsample(
+            self.policy, rollout, rollout.valid[:-1], self._config.min_keep_prob, rng
+        )
         turns = rollout.actions.shape[0]
         truth = {name: v[:turns].flatten(0, 1)[rows].numpy() for name, v in rollout.central.items()}
         advantages = self._teacher.advantages(truth)
@@ -98,7 +100,7 @@ class Imitation:
         loss = share @ losses
         self.optimizer.zero_grad()
         loss.backward()
-        norm = nn.utils.clip_grad_norm_(self.policy.parameters(), self._config.max_gradient)
+        norm = nn.utils.clip_grad_norm_(self.policy.parameters(), self._config.max_grad_norm)
         self.optimizer.step()
         with torch.no_grad():
             probs = log_probs.exp()

@@ -56,12 +56,12 @@ class PolicyGradient:
         an agent to have two turns of its own (IPPO).
         """
         estimate = self._estimator.estimate(rollout)
-        if not estimate.counted.any():
+        if not estimate.loss_mask.any():
             raise InvalidOptionError(
                 f"algorithm.turns: expected a segment in which turns can be told from what follows them, got one of "
                 f"{len(rollout.actions)} turns of which none can"
             )
-        samples = samples_of(self.policy, rollout, estimate, self._ppo.config.keep_least, rng)
+        samples = samples_of(self.policy, rollout, estimate, self._ppo.config.min_keep_prob, rng)
         report = self._ppo.update(samples, progress, rng)
         return {**asdict(report), "explained_variance": estimate.explained_variance}
 

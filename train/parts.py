@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import torch
 
-from marl_sched.agents.base import AdvantageScheduler
+from marl_sched.agents.base import AdvantageScheduler, PrivilegedInfo
 from marl_sched.agents.networks.architectures import new_network
 from marl_sched.agents.networks.hetgat.network import HetGATCritic
 from marl_sched.agents.networks.network import PolicyNetwork, slots_of
@@ -128,7 +128,12 @@ def _with_critic(
 ) -> tuple[Collector, Learner]:
     env = _environment(config, length, rows=algorithm.instances, episodes=1)
     critic = _critic(config, env, algorithm.critic)
-    credit = estimator(critic, discount=algorithm.discount, trace=algorithm.trace, centred=algorithm.centred)
+    credit = estimator(
+        critic,
+        discount=algorithm.discount,
+        gae_lambda=algorithm.gae_lambda,
+        reward_centering=algorithm.reward_centering,
+    )
     learner = PolicyGradient(Ppo(_policy(config, env), critic, algorithm.ppo), credit)
     return SegmentCollector(env, turns=algorithm.turns, length=length(0), central=central), learner
 
@@ -162,7 +167,9 @@ def _with_teacher(config: TrainConfig, algorithm: ImitationConfig, length: Episo
             f"train: algorithm.teacher: expected a scheduler that can tell how good every choice is, "
             f"got {algorithm.teacher}"
         )
-    if "clock" in teacher.needs:  # training episodes are cut before the end that such a teacher plans for
+    if (
+        PrivilegedInfo.TIME_LEFT in teacher.privileged_info
+    ):  # training episodes are cut before the end that such a teacher plans for
         raise InvalidOptionError(
             f"train: algorithm.teacher: expected a scheduler that does not heed the time left, got {algorithm.teacher}"
         )
@@ -173,7 +180,7 @@ def _with_teacher(config: TrainConfig, algorithm: ImitationConfig, length: Episo
 
 def _hides(config: TrainConfig) -> bool:
     """Whether agents see less than everything, so that the full graph is recorded beside their own."""
-    return config.view["kind"] != "full"
+    return bool(config.make_view().hides)
 
 
 def _critic(config: TrainConfig, env: SchedulingTorchRL, sizes: HetGATConfig) -> HetGATCritic:

@@ -57,27 +57,27 @@ class Sampler:
         return names.gather(1, picked).squeeze(1), log_probs.gather(1, picked).squeeze(1)
 
 
-def thinned(
-    policy: PolicyNetwork, rollout: Rollout, counted: Tensor, keep_least: float, rng: np.random.Generator
+def importance_subsample(
+    policy: PolicyNetwork, rollout: Rollout, loss_mask: Tensor, min_keep_prob: float, rng: np.random.Generator
 ) -> tuple[TensorDict, Tensor, Tensor]:
     """Turns of a rollout as a flat TensorDict of compacted graphs, with weights.
 
-    Turns that are not `counted`, bool (T, B), are left behind here, whatever they hold. Of the others a turn is
-    kept with probability q = max(1 - p, keep_least), p being the probability of what was chosen, and weighs 1 / q:
+    Turns outside `loss_mask`, bool (T, B), are left behind here, whatever they hold. Of the others a turn is
+    kept with probability q = max(1 - p, min_keep_prob), p being the probability of what was chosen, and weighs 1 / q:
     where a policy is nearly certain (a crew that waits, hour after hour) there is little to learn, and
-    the weights keep every sum's expectation. `keep_least` 1 keeps all.
+    the weights keep every sum's expectation. `min_keep_prob` 1 keeps all.
 
     Raises InvalidOptionError if none is kept.
     Returns the samples, the action that each decision node of theirs stands for, int64 (N, n_kept), and
     the row of the flattened rollout (T B) that each comes from, int64 (N,).
     """
-    certainty = torch.where(counted, rollout.log_probs, 0.0).exp()
-    keep = (1 - certainty).clamp(keep_least, 1.0)
-    rows = (counted & (torch.from_numpy(rng.random(counted.shape)) < keep)).flatten().nonzero().squeeze(1)
+    certainty = torch.where(loss_mask, rollout.log_probs, 0.0).exp()
+    keep = (1 - certainty).clamp(min_keep_prob, 1.0)
+    rows = (loss_mask & (torch.from_numpy(rng.random(loss_mask.shape)) < keep)).flatten().nonzero().squeeze(1)
     if not len(rows):
         raise InvalidOptionError(
-            f"train: none of the {int(counted.sum())} turns of an update that count was kept to learn from; expected "
-            "more instances, longer segments (algorithm.turns) or a larger share of certain turns (keep_least)"
+            f"train: none of the {int(loss_mask.sum())} turns of an update that count was kept to learn from; expected "
+            "more instances, longer segments (algorithm.turns) or a larger share of certain turns (min_keep_prob)"
         )
     observation, names = _as_read(policy, _picked(rollout.observation, rows))
     data = {"observation": observation, "weight": (1 / keep).flatten()[rows]}
@@ -85,17 +85,17 @@ def thinned(
 
 
 def samples_of(
-    policy: PolicyNetwork, rollout: Rollout, estimate: Estimate, keep_least: float, rng: np.random.Generator
+    policy: PolicyNetwork, rollout: Rollout, estimate: Estimate, min_keep_prob: float, rng: np.random.Generator
 ) -> TensorDict:
-    """Turns to learn from (`thinned`), with what was chosen, normalised advantages and value targets."""
-    samples, names, rows = thinned(policy, rollout, estimate.counted, keep_least, rng)
+    """Turns to learn from (`importance_subsample`), with what was chosen, normalised advantages and value targets."""
+    samples, names, rows = importance_subsample(policy, rollout, estimate.loss_mask, min_keep_prob, rng)
 
     def pick(values: Tensor) -> Tensor:
         return values.flatten(0, 1)[rows]
 
     samples["target"] = (names == pick(rollout.actions)[:, None]).int().argmax(1)
     samples["log_prob"] = pick(rollout.log_probs)
-    samples["advantage"] = pick(normalised(estimate.advantages, estimate.counted)).float()
+    samples["advantage"] = pick(normalised(estimate.advantages, estimate.loss_mask)).float()
     if estimate.value_targets is not None:
         samples["value_target"] = pick(estimate.value_targets).float()
         if rollout.central is not rollout.observation:
@@ -143,8 +143,10 @@ class Ppo:
     """
 
     def __init__(self, policy: PolicyNetwork, critic: nn.Module | None, config: PpoConfig) -> None:
-        if critic is None and config.critic_alone > 0:
-            raise InvalidOptionError(f"ppo: critic_alone: there is no critic to learn alone, got {config.critic_alone}")
+        if critic is None and config.critic_warmup > 0:
+            raise InvalidOptionError(
+                f"ppo: critic_warmup: there is no critic to learn alone, got {config.critic_warmup}"
+            )
         self.policy, self.critic, self.config = policy, critic, config
         self.modules: dict[str, nn.Module] = {"policy": policy} | ({"critic": critic} if critic is not None else {})
         self.optimizer = torch.optim.Adam(
@@ -156,7 +158,7 @@ class Ppo:
         config = self.config
         entropy_weight = between(config.entropy, config.final_entropy, progress)
         rate = between(config.learning_rate, config.final_learning_rate, progress)
-        of_policy = 0.0 if progress < config.critic_alone else config.policy_rate
+        of_policy = 0.0 if progress < config.critic_warmup else config.policy_rate
         for name, group in zip(self.modules, self.optimizer.param_groups, strict=True):
             group["lr"] = rate * (of_policy if name == "policy" else 1.0)
         device = device_of(self.policy)
@@ -182,7 +184,7 @@ class Ppo:
         self.optimizer.zero_grad()
         total.backward()
         norms = [
-            nn.utils.clip_grad_norm_(module.parameters(), self.config.max_gradient) for module in self.modules.values()
+            nn.utils.clip_grad_norm_(module.parameters(), self.config.max_grad_norm) for module in self.modules.values()
         ]
         self.optimizer.step()
         with torch.no_grad():

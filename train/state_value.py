@@ -57,14 +57,14 @@ class StateValueBaseline:
 
     def estimate(self, rollout: Rollout) -> Estimate:
         """Advantages and value targets."""
-        counted, times = rollout.valid[:-1], rollout.times[:-1]
+        loss_mask, times = rollout.valid[:-1], rollout.times[:-1]
         returns = returns_by_time(
-            rollout.rewards, rollout.elapsed, times, counted, discount=self._discount, length=rollout.length
+            rollout.rewards, rollout.elapsed, times, loss_mask, discount=self._discount, length=rollout.length
         )
-        targets = torch.where(counted, returns.gather(0, torch.where(counted, times, 0)), 0.0)
+        targets = torch.where(loss_mask, returns.gather(0, torch.where(loss_mask, times, 0)), 0.0)
         values = values_of(self._critic, rollout)[:-1]
-        advantages = torch.where(counted, targets - values, 0.0)
-        return Estimate(advantages, targets, explained_variance(targets, values, counted), counted)
+        advantages = torch.where(loss_mask, targets - values, 0.0)
+        return Estimate(advantages, targets, explained_variance(targets, values, loss_mask), loss_mask)
 
     def state(self) -> dict[str, float | None]:
         """Nothing."""

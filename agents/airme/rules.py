@@ -14,7 +14,7 @@ from typing import cast
 import numpy as np
 
 from marl_sched.agents.airme.bound.index import require_types
-from marl_sched.agents.base import ObservationScheduler, best_action
+from marl_sched.agents.base import ObservationScheduler, PrivilegedInfo, best_action
 from marl_sched.envs.airme.aircraft import PUBLISHED_TYPES, AircraftType, FailureModel, failure_table
 from marl_sched.envs.airme.graph import graph_spec
 from marl_sched.envs.airme.simulator import AirmeSimulator
@@ -56,8 +56,10 @@ class PriorityRule(ObservationScheduler):
 
     heeds_objective = False
 
-    def __init__(self, name: str, priority: Callable[[_Fleet], np.ndarray], needs: str = "") -> None:
-        self.name, self.needs, self._priority = name, needs, priority
+    def __init__(
+        self, name: str, priority: Callable[[_Fleet], np.ndarray], privileged_info: PrivilegedInfo = PrivilegedInfo.NONE
+    ) -> None:
+        self.name, self.privileged_info, self._priority = name, privileged_info, priority
 
     def choose(self, observation: Observation, uniform: np.ndarray) -> np.ndarray:
         """Actions int64 (B,); `uniform` is not used."""
@@ -131,7 +133,7 @@ class ModelBasedRule(PriorityRule):
         types: Sequence[AircraftType] = PUBLISHED_TYPES,
         failure: FailureModel = "density",
     ) -> None:
-        super().__init__("model-based", self._by_risk, needs="failure model")
+        super().__init__("model-based", self._by_risk, privileged_info=PrivilegedInfo.FAILURE_MODEL)
         self._threshold, self._types, self._failure = threshold, tuple(types), failure
 
     def start(self, simulator: TurnSimulator, rows: np.ndarray) -> None:

@@ -6,7 +6,7 @@ from abc import abstractmethod
 
 import numpy as np
 
-from marl_sched.agents.base import Scheduler
+from marl_sched.agents.base import PrivilegedInfo, Scheduler
 from marl_sched.agents.murse.problem import Plan
 from marl_sched.agents.murse.snapshot import as_murse
 from marl_sched.envs.murse.simulator import MurseSimulator
@@ -22,7 +22,7 @@ class PlanningScheduler(Scheduler):
     task that the plan leaves out is never done.
     """
 
-    needs = "all durations, waits, deadlines and places"
+    privileged_info = PrivilegedInfo.DURATIONS | PrivilegedInfo.WAITS | PrivilegedInfo.DEADLINES | PrivilegedInfo.PLACES
 
     def __init__(self) -> None:
         self._rounds: np.ndarray = np.empty(0, np.int64)

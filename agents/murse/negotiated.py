@@ -6,7 +6,7 @@ from abc import abstractmethod
 
 import numpy as np
 
-from marl_sched.agents.base import Scheduler
+from marl_sched.agents.base import PrivilegedInfo, Scheduler
 from marl_sched.agents.murse.auctions.agent_schedule import UNKNOWN, AgentSchedule
 from marl_sched.agents.murse.auctions.cbba import CbbaBidder
 from marl_sched.agents.murse.auctions.network import Bidder, hearing, negotiate
@@ -37,7 +37,7 @@ class NegotiatingScheduler(Scheduler):
         traffic: messages and bytes by row and round.
     """
 
-    needs = "all durations, waits, deadlines and places"
+    privileged_info = PrivilegedInfo.DURATIONS | PrivilegedInfo.WAITS | PrivilegedInfo.DEADLINES | PrivilegedInfo.PLACES
 
     def __init__(self, radius: float | None = None) -> None:
         if radius is not None and not radius >= 0:

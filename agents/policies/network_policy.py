@@ -109,7 +109,7 @@ class NetworkPolicy(ObservationScheduler):
 
     def _of_epoch(self, simulator: TurnSimulator, rows: np.ndarray, observation: Observation) -> np.ndarray:
         """The logits of the first turn of each row's decision epoch, for the actions that are still legal."""
-        if simulator.view.kind != "full":
+        if simulator.view.hides:
             raise InvalidOptionError(
                 f"mode of policy {self.name}: one_pass shares what the first agent sees, so it is for the full view; "
                 f"got view {simulator.view.kind}"

@@ -28,6 +28,7 @@ class FullView:
     """Every crew sees every plane and every crew as they are, and all choices already made this hour."""
 
     kind = "full"
+    hides = False
 
     @property
     def limits(self) -> Limits:
@@ -55,6 +56,7 @@ class LocalView:
     """
 
     kind = "local"
+    hides = True
 
     reach: int = 1
     comm: int = 1
@@ -92,6 +94,7 @@ class RandomView:
     """
 
     kind = "random"
+    hides = True
 
     reach_most: int = 3
     comm_most: int = 3

@@ -23,6 +23,7 @@ class FullView:
     """Every agent sees every task and every agent with its commitments."""
 
     kind = "full"
+    hides = False
 
     @property
     def limits(self) -> tuple[float, float]:
@@ -41,6 +42,7 @@ class LocalView:
     """
 
     kind = "local"
+    hides = True
 
     sensing: float = 4.0  # map units
     comm: float = 4.0

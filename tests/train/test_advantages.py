@@ -29,7 +29,7 @@ def test_a_turn_within_a_decision_epoch_discounts_nothing_and_one_that_passes_ti
     # Two turns in one decision epoch, the second lets 2 units pass. gamma = 1/2, lambda = 1.
     # delta_1 = 3 + 0.25 * 8 - 1 = 4; delta_0 = 0 + 1 * 1 - 2 = -1; A_1 = 4; A_0 = -1 + 1 * 4 = 3.
     advantages, targets = generalised_advantages(
-        column(0, 3), column(0, 2), column(2, 1, 8), flags(1, 1, 1), flags(1, 1, 1), discount=0.5, trace=1.0
+        column(0, 3), column(0, 2), column(2, 1, 8), flags(1, 1, 1), flags(1, 1, 1), discount=0.5, gae_lambda=1.0
     )
     assert advantages[:, 0].tolist() == [3.0, 4.0]
     assert targets[:, 0].tolist() == [5.0, 5.0]
@@ -39,15 +39,15 @@ def test_the_trace_fades_with_simulated_time():
     # gamma = 1, lambda = 1/2, no values: A_2 = 8, A_1 = 4 + (1/2)^2 * 8 = 6, A_0 = 2 + (1/2)^0 * 6 = 8.
     ones = flags(1, 1, 1, 1)
     advantages, _ = generalised_advantages(
-        column(2, 4, 8), column(0, 2, 1), column(0, 0, 0, 0), ones, ones, discount=1.0, trace=0.5
+        column(2, 4, 8), column(0, 2, 1), column(0, 0, 0, 0), ones, ones, discount=1.0, gae_lambda=0.5
     )
     assert advantages[:, 0].tolist() == [8.0, 6.0, 8.0]
 
 
 def test_an_end_is_worth_nothing_and_a_cut_is_worth_its_value():
     rewards, elapsed, values, valid = column(1, 1), column(1, 1), column(0, 0, 100), flags(1, 1, 0)
-    ended, _ = generalised_advantages(rewards, elapsed, values, valid, flags(1, 1, 0), discount=0.5, trace=0.0)
-    cut, _ = generalised_advantages(rewards, elapsed, values, valid, flags(1, 1, 1), discount=0.5, trace=0.0)
+    ended, _ = generalised_advantages(rewards, elapsed, values, valid, flags(1, 1, 0), discount=0.5, gae_lambda=0.0)
+    cut, _ = generalised_advantages(rewards, elapsed, values, valid, flags(1, 1, 1), discount=0.5, gae_lambda=0.0)
     assert ended[:, 0].tolist() == [1.0, 1.0]
     assert cut[:, 0].tolist() == [1.0, 51.0]
 
@@ -62,11 +62,12 @@ def test_an_own_turn_lasts_until_the_agents_next_one_and_earns_what_the_team_doe
     #          turn 0: earns 0 + 2 = 2 in 1 hour, target 2 + 3/2 + (1/2)(1/2) 8 = 5.5, advantage 5.5 - 1 = 4.5.
     # Agent 1, turn 3 is its last: not learned from. Turn 1: earns 2 + 4/2 = 4 in 3 hours, target 4 + 16/8 = 6,
     #          advantage 6 - 5 = 1; nothing flows back from turn 3 but its value.
-    advantages, targets, counted = own_turn_advantages(
+    advantages, targets, loss_mask = own_turn_advantages(
         column(0, 2, 4, 8), column(0, 1, 2, 1), column(1, 5, 3, 16, 40),
-        torch.tensor([[0], [1], [0], [1], [0]]), flags(1, 1, 1, 1, 1), flags(1, 1, 1, 1, 1), discount=0.5, trace=0.5,
+        torch.tensor([[0], [1], [0], [1], [0]]), flags(1, 1, 1, 1, 1), flags(1, 1, 1, 1, 1),
+        discount=0.5, gae_lambda=0.5,
     )  # fmt: skip
-    assert counted[:, 0].tolist() == [True, True, True, False]
+    assert loss_mask[:, 0].tolist() == [True, True, True, False]
     assert advantages[:, 0].tolist() == [4.5, 1.0, 8.0, 0.0]
     assert targets[:, 0].tolist() == [5.5, 6.0, 11.0, 0.0]
 
@@ -80,10 +81,10 @@ def test_no_own_turn_is_lost_where_an_episode_ends_and_none_reaches_over_its_cut
     alive = torch.tensor([[1, 1], [1, 1], [0, 1], [1, 1], [1, 1]]).bool()
     rewards = torch.tensor([[1.0, 1.0], [2.0, 2.0], [NAN, NAN], [100.0, 100.0]])
     values = torch.tensor([[0.0, 0.0], [0.0, 0.0], [NAN, 7.0], [0.0, 0.0], [1000.0, 1000.0]])
-    advantages, _, counted = own_turn_advantages(
-        rewards, torch.ones(4, 2, dtype=torch.int64), values, agents, valid, alive, discount=1.0, trace=1.0
+    advantages, _, loss_mask = own_turn_advantages(
+        rewards, torch.ones(4, 2, dtype=torch.int64), values, agents, valid, alive, discount=1.0, gae_lambda=1.0
     )
-    assert counted.T.tolist() == [[True, True, False, True], [False, True, False, False]]
+    assert loss_mask.T.tolist() == [[True, True, False, True], [False, True, False, False]]
     assert advantages.T.tolist() == [[3.0, 2.0, 0.0, 1100.0], [0.0, 9.0, 0.0, 0.0]]
 
 
@@ -93,7 +94,7 @@ def test_one_agents_own_turns_are_the_teams():
     elapsed = torch.from_numpy(rng.integers(0, 4, (20, 6)))
     alive = torch.from_numpy(rng.random((21, 6)) < 0.9)
     valid = alive & torch.from_numpy(rng.random((21, 6)) < 0.8)
-    factors = {"discount": 0.9, "trace": 0.7}
+    factors = {"discount": 0.9, "gae_lambda": 0.7}
     team = generalised_advantages(rewards, elapsed, values, valid, alive, **factors)
     own = own_turn_advantages(rewards, elapsed, values, torch.zeros_like(valid).long(), valid, alive, **factors)
     assert own[2].equal(valid[:-1])
@@ -103,13 +104,13 @@ def test_one_agents_own_turns_are_the_teams():
 @pytest.mark.parametrize("seed", range(20))
 def test_own_turns_agree_with_a_plain_walk_from_turn_to_turn(seed: int):
     rng = np.random.default_rng(seed)
-    turns, rows, discount, trace = 30, 5, 0.9, 0.8
+    turns, rows, discount, gae_lambda = 30, 5, 0.9, 0.8
     alive = rng.random((turns + 1, rows)) < 0.93
     valid = alive & (rng.random((turns + 1, rows)) < 0.93)
     agents = np.where(alive, rng.integers(0, 1 + seed % 4, alive.shape), -1)
     rewards, elapsed = rng.normal(size=(turns, rows)), rng.integers(0, 4, (turns, rows))
     values = rng.normal(size=(turns + 1, rows))
-    expected, counted = np.zeros((2, turns, rows)), np.zeros((turns, rows), bool)
+    expected, loss_mask = np.zeros((2, turns, rows)), np.zeros((turns, rows), bool)
     for t, row in reversed(np.argwhere(valid[:-1]).tolist()):
         earned, passed, later = 0.0, 0, t
         while True:
@@ -120,9 +121,9 @@ def test_own_turns_agree_with_a_plain_walk_from_turn_to_turn(seed: int):
                 break
         mine = agents[later, row] == agents[t, row]
         future = values[later, row] if alive[later, row] else 0.0
-        credit = 0.0 if over else trace**passed * expected[0, later, row]
-        counted[t, row] = mine or not alive[later, row]
-        if counted[t, row]:
+        credit = 0.0 if over else gae_lambda**passed * expected[0, later, row]
+        loss_mask[t, row] = mine or not alive[later, row]
+        if loss_mask[t, row]:
             target = earned + discount**passed * (future + credit)
             expected[:, t, row] = target - values[t, row], target
     found = own_turn_advantages(
@@ -133,9 +134,9 @@ def test_own_turns_agree_with_a_plain_walk_from_turn_to_turn(seed: int):
         torch.from_numpy(valid),
         torch.from_numpy(alive),
         discount=discount,
-        trace=trace,
+        gae_lambda=gae_lambda,
     )
-    assert found[2].numpy().tolist() == counted.tolist()
+    assert found[2].numpy().tolist() == loss_mask.tolist()
     np.testing.assert_allclose(np.stack([found[0], found[1]]), expected, atol=1e-12)
 
 
@@ -143,7 +144,7 @@ def test_nothing_reaches_over_a_cut_into_the_next_episode():
     # Turn 1 is a cut: its state counts as turn 0's future, what the next episode brings does not.
     advantages, _ = generalised_advantages(
         column(1, NAN, 1000), column(1, 1, 1), column(0, 6, 0, 0), flags(1, 0, 1, 1), flags(1, 1, 1, 1),
-        discount=0.5, trace=1.0,
+        discount=0.5, gae_lambda=1.0,
     )  # fmt: skip
     assert advantages[:, 0].tolist() == [4.0, 0.0, 1000.0]
 
@@ -151,7 +152,7 @@ def test_nothing_reaches_over_a_cut_into_the_next_episode():
 def test_masked_turns_may_hold_nan():
     valid, alive = flags(1, 0, 0), flags(1, 0, 0)
     advantages, targets = generalised_advantages(
-        column(2, NAN), column(1, NAN), column(0, NAN, NAN), valid, alive, discount=0.9, trace=0.9
+        column(2, NAN), column(1, NAN), column(0, NAN, NAN), valid, alive, discount=0.9, gae_lambda=0.9
     )
     assert advantages[:, 0].tolist() == [2.0, 0.0]
     assert targets[:, 0].tolist() == [2.0, 0.0]
@@ -204,6 +205,6 @@ def test_step_baseline_agrees_with_a_plain_loop_over_hours():
 def test_normalised_advantages_have_mean_zero_and_deviation_one_over_valid_turns_alone():
     scaled = normalised(torch.tensor([[1.0, NAN], [3.0, 5.0]]), torch.tensor([[True, False], [True, True]]))
     assert scaled[0, 1] == 0.0
-    counted = torch.stack([scaled[0, 0], scaled[1, 0], scaled[1, 1]])
-    assert counted.mean().item() == pytest.approx(0.0, abs=1e-6)
-    assert counted.std(correction=0).item() == pytest.approx(1.0, abs=1e-6)
+    loss_mask = torch.stack([scaled[0, 0], scaled[1, 0], scaled[1, 1]])
+    assert loss_mask.mean().item() == pytest.approx(0.0, abs=1e-6)
+    assert loss_mask.std(correction=0).item() == pytest.approx(1.0, abs=1e-6)

@@ -8,7 +8,7 @@ import pytest
 from marl_sched.envs.airme.views import FullView, LocalView
 from marl_sched.errors import InvalidFileError, InvalidOptionError, UnknownNameError
 from marl_sched.files import write_json
-from marl_sched.train.config import GaeConfig, RunRecord, StepBaselineConfig, load_config, load_record
+from marl_sched.train.config import RENAMED, GaeConfig, RunRecord, StepBaselineConfig, load_config, load_record
 
 
 def test_defaults_are_the_recipe_of_the_full_view():
@@ -84,4 +84,18 @@ def test_a_record_with_an_unknown_key_is_refused_by_file(tmp_path: Path):
     record = RunRecord(config=load_config([]), overrides=[], revision="")
     write_json(tmp_path / "config.json", msgspec.to_builtins(record) | {"rounds": 3})
     with pytest.raises(InvalidFileError, match=r"config\.json: expected the record of a training run: .*rounds"):
+        load_record(tmp_path / "config.json")
+
+
+@pytest.mark.parametrize(("old", "new"), sorted(RENAMED.items()))
+def test_an_old_option_name_is_refused_with_the_new_one(old: str, new: str):
+    with pytest.raises(InvalidOptionError, match=rf"algorithm\.ppo\.{old} was renamed: expected algorithm\.ppo\.{new}"):
+        load_config([f"algorithm.ppo.{old}=1"])
+
+
+def test_a_record_with_an_old_option_name_is_refused_with_the_new_one(tmp_path: Path):
+    record = msgspec.to_builtins(RunRecord(config=load_config([]), overrides=[], revision=""))
+    record["config"]["algorithm"]["trace"] = record["config"]["algorithm"].pop("gae_lambda")
+    write_json(tmp_path / "config.json", record)
+    with pytest.raises(InvalidFileError, match=r"config\.algorithm\.trace was renamed: expected .*gae_lambda"):
         load_record(tmp_path / "config.json")

@@ -22,7 +22,7 @@ from marl_sched.train.run import train_from_overrides
 
 CONFIG = ImitationConfig(
     instances=6, turns=20, teacher="none", epochs=1, minibatch=64, learning_rate=1e-2, final_learning_rate=1e-2,
-    temperature=0.1, final_temperature=0.1, max_gradient=1.0, keep_least=1.0,
+    temperature=0.1, final_temperature=0.1, max_grad_norm=1.0, min_keep_prob=1.0,
 )  # fmt: skip
 
 

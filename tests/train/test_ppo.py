@@ -17,11 +17,11 @@ from marl_sched.train.collect import EpisodeCollector, InstanceSource, Rollout, 
 from marl_sched.train.config import PpoConfig
 from marl_sched.train.estimators import CriticEstimator, Estimate, OwnTurns, StepBaseline
 from marl_sched.train.learner import PolicyGradient
-from marl_sched.train.ppo import Ppo, Sampler, policy_loss, samples_of, thinned
+from marl_sched.train.ppo import Ppo, Sampler, importance_subsample, policy_loss, samples_of
 
 CONFIG = PpoConfig(
     clip=0.2, epochs=2, minibatch=64, learning_rate=1e-3, final_learning_rate=0.0, entropy=0.01, final_entropy=0.0,
-    max_gradient=0.5, keep_least=1.0,
+    max_grad_norm=0.5, min_keep_prob=1.0,
 )  # fmt: skip
 
 
@@ -53,9 +53,11 @@ def poisoned(rollout: Rollout) -> Rollout:
     return replace(rollout, observation=observation, **columns)
 
 
-def learn(rollout: Rollout, policy: HetGATNetwork, critic: HetGATCritic, keep_least: float = 1.0) -> list[torch.Tensor]:
-    estimator = CriticEstimator(critic, discount=0.9, trace=0.9, centred=True)
-    samples = samples_of(policy, rollout, estimator.estimate(rollout), keep_least, np.random.default_rng(0))
+def learn(
+    rollout: Rollout, policy: HetGATNetwork, critic: HetGATCritic, min_keep_prob: float = 1.0
+) -> list[torch.Tensor]:
+    estimator = CriticEstimator(critic, discount=0.9, gae_lambda=0.9, reward_centering=True)
+    samples = samples_of(policy, rollout, estimator.estimate(rollout), min_keep_prob, np.random.default_rng(0))
     ppo = Ppo(policy, critic, CONFIG)
     for _ in range(2):
         ppo.update(samples, 0.0, np.random.default_rng(1))
@@ -167,10 +169,10 @@ def test_a_policy_stays_as_it_is_while_the_critic_learns_alone_and_then_learns_a
     for progress, rate in ((0.05, 1.0), (0.1, 1.0), (0.1, 0.1)):
         policy, critic = networks()
         rollout = segment(policy)
-        estimate = CriticEstimator(critic, discount=0.9, trace=0.9, centred=True).estimate(rollout)
+        estimate = CriticEstimator(critic, discount=0.9, gae_lambda=0.9, reward_centering=True).estimate(rollout)
         samples = samples_of(policy, rollout, estimate, 1.0, np.random.default_rng(0))
         before = [parameter.detach().clone() for module in (policy, critic) for parameter in module.parameters()]
-        config = msgspec.structs.replace(CONFIG, critic_alone=0.1, policy_rate=rate, epochs=1, minibatch=10**6)
+        config = msgspec.structs.replace(CONFIG, critic_warmup=0.1, policy_rate=rate, epochs=1, minibatch=10**6)
         Ppo(policy, critic, config).update(samples, progress, np.random.default_rng(1))
         after = [parameter.detach() for module in (policy, critic) for parameter in module.parameters()]
         n = len(list(policy.parameters()))
@@ -184,14 +186,16 @@ def test_a_policy_stays_as_it_is_while_the_critic_learns_alone_and_then_learns_a
 
 
 def test_a_critic_that_is_not_there_cannot_learn_alone() -> None:
-    with pytest.raises(InvalidOptionError, match="critic_alone"):
-        Ppo(networks()[0], None, msgspec.structs.replace(CONFIG, critic_alone=0.1))
+    with pytest.raises(InvalidOptionError, match="critic_warmup"):
+        Ppo(networks()[0], None, msgspec.structs.replace(CONFIG, critic_warmup=0.1))
 
 
 def test_a_segment_in_which_no_agent_has_two_turns_is_refused() -> None:
     policy, critic = networks()
     rollout = SegmentCollector(environment(), turns=1, length=8, central=False).collect(Sampler(policy), 8)
-    learner = PolicyGradient(Ppo(policy, critic, CONFIG), OwnTurns(critic, discount=0.9, trace=0.9, centred=True))
+    learner = PolicyGradient(
+        Ppo(policy, critic, CONFIG), OwnTurns(critic, discount=0.9, gae_lambda=0.9, reward_centering=True)
+    )
     with pytest.raises(InvalidOptionError, match=r"algorithm\.turns: .* 1 turns"):
         learner.learn(rollout, 0.0, np.random.default_rng(0))
 
@@ -201,4 +205,4 @@ def test_an_update_of_which_nothing_is_kept_is_refused() -> None:
     rollout = segment(policy)
     certain = replace(rollout, log_probs=torch.zeros_like(rollout.log_probs))
     with pytest.raises(InvalidOptionError, match=r"none of the .* turns of an update that count was kept"):
-        thinned(policy, certain, rollout.valid[:-1], 1e-12, np.random.default_rng(0))
+        importance_subsample(policy, certain, rollout.valid[:-1], 1e-12, np.random.default_rng(0))

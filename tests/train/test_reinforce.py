@@ -51,7 +51,7 @@ def test_an_update_is_a_step_along_the_gradient_of_reinforce(architecture: str):
     else:
         network = DeepRMNetwork(spec, slots=slots_of(spec, env.simulator.arrays), hidden=8)
     rollout = EpisodeCollector(env, central=False).collect(Sampler(network), LENGTH)
-    config = load_config(["algorithm=reinforce", "algorithm.ppo.max_gradient=1e9"]).algorithm.ppo
+    config = load_config(["algorithm=reinforce", "algorithm.ppo.max_grad_norm=1e9"]).algorithm.ppo
     expected = torch.autograd.grad(plain_loss(network, rollout), list(network.parameters()))
     before = [parameter.detach().clone() for parameter in network.parameters()]
     learner = PolicyGradient(Ppo(network, None, config), StepBaseline(discount=0.99, episodes=EPISODES))
@@ -125,7 +125,7 @@ def test_a_run_is_trained_resumed_exported_and_evaluated(
 def test_reinforce_takes_one_step_an_update_on_all_turns():
     algorithm = load_config(["algorithm=reinforce"]).algorithm
     ppo = algorithm.ppo
-    assert (algorithm.episodes, ppo.epochs, ppo.keep_least, ppo.entropy, ppo.final_entropy) == (8, 1, 1.0, 0.0, 0.0)
+    assert (algorithm.episodes, ppo.epochs, ppo.min_keep_prob, ppo.entropy, ppo.final_entropy) == (8, 1, 1.0, 0.0, 0.0)
     assert ppo.minibatch > 10**6
 
 

@@ -55,7 +55,7 @@ def test_advantages_are_what_an_episode_still_earns_less_the_critics_value(rollo
             assert estimate.value_targets[t, row] == pytest.approx(earned)
             expected = earned - (LENGTH - int(rollout.times[t, row])) / 2
             assert estimate.advantages[t, row] == pytest.approx(expected)
-    assert estimate.counted.equal(rollout.valid[:-1])
+    assert estimate.loss_mask.equal(rollout.valid[:-1])
 
 
 def test_turns_that_do_not_count_touch_nothing(rollout: Rollout, policy: HetGATNetwork):

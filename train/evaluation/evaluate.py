@@ -149,7 +149,7 @@ def evaluate_scheduler(
         per_round=_joined(per_round, len(instances)),
         visible_share=float(shares / turns),
         seconds=time.perf_counter() - started,
-        needs=scheduler.needs,
+        needs=str(scheduler.privileged_info),
     )
 
 

@@ -27,7 +27,7 @@ from marl_sched.agents.airme.bound.plane import (
     plane_model,
     reward_of,
 )
-from marl_sched.agents.base import AdvantageScheduler
+from marl_sched.agents.base import AdvantageScheduler, PrivilegedInfo
 from marl_sched.envs.airme.aircraft import PUBLISHED_TYPES, AircraftType, FailureModel
 from marl_sched.envs.airme.graph import graph_spec
 from marl_sched.envs.airme.simulator import DEFAULT_HORIZON, AirmeSimulator
@@ -66,7 +66,9 @@ class IndexScheduler(AdvantageScheduler):
         failure: FailureModel = "density",
     ) -> None:
         self.name = "index" if clock else "index-without-clock"
-        self.needs = "failure model and clock" if clock else "failure model"
+        self.privileged_info = PrivilegedInfo.FAILURE_MODEL | (
+            PrivilegedInfo.TIME_LEFT if clock else PrivilegedInfo.NONE
+        )
         self._clock = clock
         self._problem = (objective, horizon, tuple(types), failure)
         self._tables: _Tables | None = None

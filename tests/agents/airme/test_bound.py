@@ -13,7 +13,7 @@ from marl_sched.agents.airme.bound.index import IndexScheduler
 from marl_sched.agents.airme.bound.plane import immortal_values, plane_model, reward_of, solve
 from marl_sched.agents.airme.bound.relaxation import Relaxation, price_segments, upper_bounds
 from marl_sched.agents.airme.schedulers import RULES
-from marl_sched.agents.base import Scheduler
+from marl_sched.agents.base import PrivilegedInfo, Scheduler
 from marl_sched.envs.airme.aircraft import FIXED_WING, HELICOPTER, AircraftType
 from marl_sched.envs.airme.instance import AirmeInstance, generate
 from marl_sched.envs.airme.simulator import AirmeSimulator
@@ -227,8 +227,8 @@ def test_bad_option_raises() -> None:
 
 class TestIndexScheduler:
     def test_says_what_it_knows(self) -> None:
-        assert IndexScheduler().needs == "failure model and clock"
-        assert IndexScheduler(clock=False).needs == "failure model"
+        assert str(IndexScheduler().privileged_info) == "failure model and clock"
+        assert IndexScheduler(clock=False).privileged_info is PrivilegedInfo.FAILURE_MODEL
 
     def test_serves_a_worn_plane_and_leaves_a_new_one_alone(self) -> None:
         instance = AirmeInstance(

@@ -18,7 +18,7 @@ from marl_sched.agents.airme.rules import (
     preventive_first,
 )
 from marl_sched.agents.airme.schedulers import RULES
-from marl_sched.agents.base import ObservationScheduler
+from marl_sched.agents.base import ObservationScheduler, PrivilegedInfo
 from marl_sched.envs.airme.aircraft import PUBLISHED_TYPES, AircraftType, FailureModel
 from marl_sched.envs.airme.instance import AirmeInstance, generate
 from marl_sched.envs.airme.simulator import AirmeSimulator
@@ -104,7 +104,7 @@ def test_model_based_serves_worn_planes_by_their_true_failure_probability_from_0
         (HELI, 1.0, 0, 0, True), n_crews=5,
     )  # fmt: skip
     assert order(ModelBasedRule(), instance) == [5, 4, 2]
-    assert ModelBasedRule().needs == "failure model"
+    assert ModelBasedRule().privileged_info is PrivilegedInfo.FAILURE_MODEL
 
 
 def test_model_based_knows_the_hazard_where_parts_fail_by_it() -> None:
