@@ -12,20 +12,23 @@ import shlex
 from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import msgspec
 from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
-from msgspec import Meta, Struct
+from msgspec import Meta
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from marl_sched.agents.policies.cards import Heads, Layers, Mode, Width
+from marl_sched.agents.networks.registry import NetworkConfig, network_config
+from marl_sched.agents.policies.cards import Mode
 from marl_sched.domain import get_domain
 from marl_sched.errors import InvalidFileError, InvalidOptionError
 from marl_sched.files import read_json
+from marl_sched.train.algorithms.base import AlgorithmConfig, algorithm_config
+from marl_sched.train.bounds import Count, Group, Natural, NonNegative, Seed
 from marl_sched.train.device import DeviceName
 
 # Arguments of every domain's simulator that other keys of the configuration, or the trainer, decide on.
@@ -40,19 +43,8 @@ RENAMED = {
     "max_gradient": "max_grad_norm",
 }
 
-Count = Annotated[int, Meta(ge=1)]
-Natural = Annotated[int, Meta(ge=0)]
-Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]  # what marl_sched.noise takes
-Positive = Annotated[float, Meta(gt=0)]
-NonNegative = Annotated[float, Meta(ge=0)]
-Share = Annotated[float, Meta(ge=0, le=1)]
 
-
-class _Config(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A group of settings; unknown keys are errors."""
-
-
-class EnvConfig(_Config, frozen=True, kw_only=True):
+class EnvConfig(Group, frozen=True, kw_only=True):
     """The domain, the scales from which instances are drawn in turn, the reward, and simulator options."""
 
     name: str
@@ -61,113 +53,7 @@ class EnvConfig(_Config, frozen=True, kw_only=True):
     options: dict[str, Any]
 
 
-class HetGATConfig(_Config, frozen=True, kw_only=True, tag_field="name", tag="hetgat"):
-    """Sizes of a HetGAT network: features per head, heads per layer, layers."""
-
-    width: Width
-    heads: Heads
-    layers: Layers
-
-
-class DecimaConfig(_Config, frozen=True, kw_only=True, tag_field="name", tag="decima"):
-    """Sizes of Decima's three networks: features of a layer, layers of each."""
-
-    hidden: Width
-    layers: Layers
-
-
-class DeepRMConfig(_Config, frozen=True, kw_only=True, tag_field="name", tag="deeprm"):
-    """Sizes of a DeepRM network: features of a layer, layers. The largest of the run's scales sets its slots."""
-
-    hidden: Width
-    layers: Layers
-
-
-PolicyConfig = HetGATConfig | DecimaConfig | DeepRMConfig
-
-
-class PpoConfig(_Config, frozen=True, kw_only=True):
-    """Clipped surrogate optimisation (equation 6.8); learning rate and entropy bonus change linearly.
-
-    A run that starts from a trained policy must not unlearn it by the errors of a new critic: for the share
-    `critic_warmup` of its updates the policy stays as it is, and then learns `policy_rate` times as fast as the critic.
-    """
-
-    clip: Positive
-    epochs: Count
-    minibatch: Count
-    learning_rate: Positive
-    final_learning_rate: NonNegative
-    entropy: NonNegative
-    final_entropy: NonNegative
-    max_grad_norm: Positive
-    min_keep_prob: Annotated[float, Meta(gt=0, le=1)]
-    critic_warmup: Annotated[float, Meta(ge=0, lt=1)] = 0.0
-    policy_rate: Positive = 1.0
-
-
-class _CriticConfig(_Config, frozen=True, kw_only=True):
-    """Generalised advantages from a critic; rows play on from update to update, `turns` turns each."""
-
-    instances: Count
-    turns: Count
-    discount: Share
-    gae_lambda: Share
-    reward_centering: bool
-    critic: HetGATConfig
-    ppo: PpoConfig
-
-
-class GaeConfig(_CriticConfig, frozen=True, kw_only=True, tag_field="name", tag="gae"):
-    """Along the team's turns, with a critic on the full graph."""
-
-
-class IppoConfig(_CriticConfig, frozen=True, kw_only=True, tag_field="name", tag="ippo"):
-    """Along each agent's own turns, with a critic on what the agent sees."""
-
-
-class StepBaselineConfig(_Config, frozen=True, kw_only=True, tag_field="name", tag="step_baseline"):
-    """Advantages from `episodes` episodes of the same instance (algorithm 5); whole episodes every update."""
-
-    instances: Count
-    episodes: Annotated[int, Meta(ge=2)]
-    discount: Share
-    ppo: PpoConfig
-
-
-class StateValueConfig(_Config, frozen=True, kw_only=True, tag_field="name", tag="state_value"):
-    """Whole episodes as `step_baseline` plays them, with a critic on the state node as baseline (section 6.5.4)."""
-
-    instances: Count
-    episodes: Count
-    discount: Share
-    critic: HetGATConfig
-    ppo: PpoConfig
-
-
-class ImitationConfig(_Config, frozen=True, kw_only=True, tag_field="name", tag="imitation"):
-    """Choices scored by a scheduler that knows more; temperature and learning rate change linearly.
-
-    `criterion` is what is optimised: see marl_sched.train.imitation.
-
-    Rows play on from update to update, `turns` turns each, with the policy that learns.
-    """
-
-    instances: Count
-    turns: Count
-    teacher: str
-    criterion: Literal["cross_entropy", "expected_advantage"] = "cross_entropy"
-    epochs: Count
-    minibatch: Count
-    learning_rate: Positive
-    final_learning_rate: NonNegative
-    temperature: Positive
-    final_temperature: Positive
-    max_grad_norm: Positive
-    min_keep_prob: Annotated[float, Meta(gt=0, le=1)]
-
-
-class CurriculumConfig(_Config, frozen=True, kw_only=True):
+class CurriculumConfig(Group, frozen=True, kw_only=True):
     """Episode length in simulated time: see marl_sched.train.curriculum."""
 
     start: Count
@@ -176,7 +62,7 @@ class CurriculumConfig(_Config, frozen=True, kw_only=True):
     spread: Natural
 
 
-class ValidationConfig(_Config, frozen=True, kw_only=True):
+class ValidationConfig(Group, frozen=True, kw_only=True):
     """Evaluation every so many updates on fixed instances of the first scale, `length` None: whole episodes.
 
     `mode` is how the policy decides there, and then wherever its card is loaded.
@@ -187,10 +73,10 @@ class ValidationConfig(_Config, frozen=True, kw_only=True):
     episodes: Count
     seed: Seed
     length: Count | None
-    mode: Mode = "greedy"
+    mode: Mode
 
 
-class TrainConfig(_Config, frozen=True, kw_only=True):
+class TrainConfig(Group, frozen=True, kw_only=True):
     """A whole run; `configs/train.yaml`. `start_from`: a policy, by name or path, to go on from.
 
     `device`: where networks learn (marl_sched.train.device).
@@ -198,22 +84,22 @@ class TrainConfig(_Config, frozen=True, kw_only=True):
 
     env: EnvConfig
     view: dict[str, Any]
-    policy: PolicyConfig
-    algorithm: GaeConfig | IppoConfig | StepBaselineConfig | StateValueConfig | ImitationConfig
+    policy: NetworkConfig
+    algorithm: AlgorithmConfig
     curriculum: CurriculumConfig
     validation: ValidationConfig
-    start_from: str | None = None
+    start_from: str | None
     seed: Seed
     updates: Count
     threads: Count
-    device: DeviceName = "auto"
+    device: DeviceName
     run_dir: str | None
     save_every: Count
 
     def directory(self) -> str:
         """Where the run is written; by default after what most runs differ in."""
         view = "-".join(str(value) for value in self.view.values())
-        network, algorithm = (type(part).__struct_config__.tag for part in (self.policy, self.algorithm))
+        network, algorithm = self.policy.network_name(), self.algorithm.algorithm_name()
         names = (self.env.name, view, self.env.objective, network, algorithm, f"seed{self.seed}")
         return self.run_dir or f"runs/{'-'.join(str(name) for name in names)}"
 
@@ -222,7 +108,7 @@ class TrainConfig(_Config, frozen=True, kw_only=True):
         return get_domain(self.env.name).make_view(self.view)
 
 
-class Start(_Config, frozen=True, kw_only=True):
+class Start(Group, frozen=True, kw_only=True):
     """The policy that a run goes on from, as its card had it when the run began."""
 
     weights_sha256: str
@@ -230,7 +116,7 @@ class Start(_Config, frozen=True, kw_only=True):
     knowledge: str
 
 
-class RunRecord(_Config, frozen=True, kw_only=True):
+class RunRecord(Group, frozen=True, kw_only=True):
     """`config.json` of a run: the configuration, the overrides that gave it, the source that it runs on.
 
     `start` belongs to `start_from`, `resumed_on` are further revisions of the source, on which it went on later.
@@ -240,7 +126,7 @@ class RunRecord(_Config, frozen=True, kw_only=True):
     overrides: list[str]
     revision: str
     start: Start | None = None
-    resumed_on: list[str] = []
+    resumed_on: list[str] = msgspec.field(default_factory=list)
 
     @property
     def source(self) -> str:
@@ -271,30 +157,31 @@ def load_config(overrides: Sequence[str]) -> TrainConfig:
         raise InvalidOptionError(f"train: {_one_line(error)}") from error
     _refuse_renamed_in(composed)
     try:
-        config = msgspec.convert(composed, TrainConfig)
+        config = msgspec.convert(composed, TrainConfig, dec_hook=_registered)
     except msgspec.ValidationError as error:
         raise InvalidOptionError(f"train: {error}") from error
     return _checked(config)
 
 
 def load_record(path: Path) -> RunRecord:
-    """The record of a run, from its `config.json`; InvalidFileError if it does not hold one.
-
-    A policy without a name is from when there was one architecture.
-    """
+    """The record of a run, from its `config.json`; InvalidFileError if it does not hold one."""
     content = read_json(path)
-    match content:
-        case {"config": {"policy": dict() as policy}}:
-            policy.setdefault("name", "hetgat")
     try:
         _refuse_renamed_in(content)
-        record = msgspec.convert(content, RunRecord)
+        record = msgspec.convert(content, RunRecord, dec_hook=_registered)
     except InvalidOptionError as error:
         raise InvalidFileError(path, "config", f"options of this version ({error})") from error
     except msgspec.ValidationError as error:
         raise InvalidFileError(path, "", f"the record of a training run: {error}") from error
     _checked(record.config)
     return record
+
+
+def _registered(kind: type, content: Any) -> Any:
+    """Msgspec's hook for the groups whose struct a registry has."""
+    if not isinstance(content, dict):
+        raise TypeError(f"expected a group of settings, got {content!r}")
+    return {NetworkConfig: network_config, AlgorithmConfig: algorithm_config}[kind](content)
 
 
 def _checked(config: TrainConfig) -> TrainConfig:

@@ -11,9 +11,8 @@ from marl_sched.agents.networks.network import PolicyNetwork, slots_of
 from marl_sched.agents.policies.cards import PolicyCard
 from marl_sched.agents.policies.checkpoint import load_network, save_network
 from marl_sched.agents.policies.network_policy import NetworkPolicy
-from marl_sched.agents.registry import create_scheduler
 from marl_sched.domain import Domain, get_domain
-from marl_sched.train.config import GaeConfig, ImitationConfig, RunRecord, StateValueConfig, load_record
+from marl_sched.train.config import RunRecord, load_record
 from marl_sched.train.evaluation.evaluate import Settings, evaluate_scheduler
 
 CONFIG, BEST = "config.json", "policy.safetensors"  # in a run's directory
@@ -53,18 +52,7 @@ def knowledge(record: RunRecord) -> str:
     """What a run uses beyond the policy's view, the runs that it goes on from included."""
     config = record.config
     used = record.start.knowledge.split(", ") if record.start is not None and record.start.knowledge else []
-    if isinstance(config.algorithm, ImitationConfig):
-        teacher = create_scheduler(config.algorithm.teacher, config.env.name)
-        used.append(
-            f"imitation of {teacher.name}" + (f" ({teacher.privileged_info})" if teacher.privileged_info else "")
-        )
-    local = config.make_view().hides
-    if isinstance(config.algorithm, GaeConfig) and local:
-        used.append("a critic on the full graph")
-    if isinstance(config.algorithm, StateValueConfig):
-        used.append("a critic that is told the time left")
-    if isinstance(config.algorithm, ImitationConfig) and local:
-        used.append("the full graph for the teacher")
+    used += config.algorithm.knowledge(config)
     return ", ".join(dict.fromkeys(used))
 
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import torch
+from msgspec import Meta
 from tensordict import TensorDict
 from torch import Tensor, nn
 
@@ -16,12 +18,32 @@ from marl_sched.agents.policies.network_policy import inverse_distribution
 from marl_sched.errors import InvalidOptionError
 from marl_sched.graph import ACTION_MASK
 from marl_sched.train.advantages import normalised
+from marl_sched.train.bounds import Count, Group, NonNegative, Positive
 from marl_sched.train.collect import Rollout
-from marl_sched.train.config import PpoConfig
 from marl_sched.train.device import device_of
 from marl_sched.train.estimators import Estimate
 
 VALUE_WEIGHT = 0.5
+
+
+class PpoConfig(Group, frozen=True, kw_only=True):
+    """Clipped surrogate optimisation (equation 6.8); learning rate and entropy bonus change linearly.
+
+    A run that starts from a trained policy must not unlearn it by the errors of a new critic: for the share
+    `critic_warmup` of its updates the policy stays as it is, and then learns `policy_rate` times as fast as the critic.
+    """
+
+    clip: Positive
+    epochs: Count
+    minibatch: Count
+    learning_rate: Positive
+    final_learning_rate: NonNegative
+    entropy: NonNegative
+    final_entropy: NonNegative
+    max_grad_norm: Positive
+    min_keep_prob: Annotated[float, Meta(gt=0, le=1)]
+    critic_warmup: Annotated[float, Meta(ge=0, lt=1)]
+    policy_rate: Positive
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import cast
 
+from msgspec import Struct
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -25,8 +26,22 @@ from marl_sched.agents.networks.network import (
     mask_logits,
     visible_features,
 )
-from marl_sched.agents.policies.cards import DecimaSizes
+from marl_sched.agents.networks.registry import NAME, NetworkConfig
+from marl_sched.agents.policies.cards import Layers, Width
 from marl_sched.graph import GraphSpec
+
+
+class DecimaConfig(
+    NetworkConfig, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field=NAME, tag="decima"
+):
+    """Sizes of Decima's networks f, g and q: features of a layer, layers of each."""
+
+    hidden: Width
+    layers: Layers
+
+    def build(self, graph: GraphSpec) -> DecimaNetwork:
+        """See NetworkConfig."""
+        return DecimaNetwork(graph, hidden=self.hidden, layers=self.layers)
 
 
 class DecimaNetwork(PolicyNetwork):
@@ -39,12 +54,11 @@ class DecimaNetwork(PolicyNetwork):
     """
 
     permutation_equivariant = True
-    sizes: DecimaSizes
 
     def __init__(self, spec: GraphSpec, *, hidden: int = 64, layers: int = 3) -> None:
         super().__init__()
         self.spec = spec
-        self.sizes = DecimaSizes(hidden=hidden, layers=layers)
+        self.config = DecimaConfig(hidden=hidden, layers=layers)
         self.f = fully_connected(len(spec.node(spec.decision_of).features), hidden, hidden, layers)
         self.g = fully_connected(hidden, hidden, hidden, layers)
         self.q = fully_connected(2 * hidden, hidden, 1, layers)

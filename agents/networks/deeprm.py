@@ -8,8 +8,10 @@ planes and crews, the largest of a scale, and there is a model for every scale.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Self
 
 import torch
+from msgspec import Struct, structs
 from torch import Tensor
 
 from marl_sched.agents.networks.network import (
@@ -19,9 +21,31 @@ from marl_sched.agents.networks.network import (
     mask_logits,
     visible_features,
 )
-from marl_sched.agents.policies.cards import DeepRMSizes
+from marl_sched.agents.networks.registry import NAME, NetworkConfig
+from marl_sched.agents.policies.cards import Layers, Slots, Width
 from marl_sched.errors import InvalidOptionError
 from marl_sched.graph import STATE, GraphSpec
+
+
+class DeepRMConfig(
+    NetworkConfig, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field=NAME, tag="deeprm"
+):
+    """Sizes of a DeepRM network: features of a layer, layers, and the slots of every node type that it reads.
+
+    A configuration leaves the slots empty; they are those of the largest of a run's scales (`for_slots`).
+    """
+
+    hidden: Width
+    layers: Layers
+    slots: dict[str, Slots] = {}
+
+    def build(self, graph: GraphSpec) -> DeepRMNetwork:
+        """See NetworkConfig."""
+        return DeepRMNetwork(graph, slots=self.slots, hidden=self.hidden, layers=self.layers)
+
+    def for_slots(self, slots: Mapping[str, int]) -> Self:
+        """These sizes for observations with that many slots (node type -> slots)."""
+        return structs.replace(self, slots=dict(slots))
 
 
 class DeepRMNetwork(PolicyNetwork):
@@ -37,7 +61,7 @@ class DeepRMNetwork(PolicyNetwork):
     """
 
     permutation_equivariant = False
-    sizes: DeepRMSizes
+    config: DeepRMConfig
 
     def __init__(self, spec: GraphSpec, *, slots: Mapping[str, int], hidden: int = 64, layers: int = 4) -> None:
         super().__init__()
@@ -45,24 +69,24 @@ class DeepRMNetwork(PolicyNetwork):
         if sorted(slots) != sorted(names):
             raise InvalidOptionError(f"slots: expected a number for each of {sorted(names)}, got {sorted(slots)}")
         self.spec = spec
-        self.sizes = DeepRMSizes(hidden=hidden, layers=layers, slots=dict(slots))
+        self.config = DeepRMConfig(hidden=hidden, layers=layers, slots=dict(slots))
         n_in = sum(slots[node.name] * len(node.features) for node in spec.nodes) + len(spec.state_features)
         self.stack = fully_connected(n_in, hidden, slots[spec.decision_of], layers)
         explore_at_first(self.stack)
 
     def reads(self, slots: Mapping[str, int]) -> bool:
         """Only those that it was made for."""
-        return dict(slots) == self.sizes.slots
+        return dict(slots) == self.config.slots
 
     def forward(self, observation: Mapping[str, Tensor], weights: None = None) -> Tensor:
         """Logits (B, n_actions), see PolicyNetwork.
 
         Raises InvalidOptionError for an observation with other numbers of slots.
         """
-        found = {name: observation[name].shape[1] for name in self.sizes.slots}
+        found = {name: observation[name].shape[1] for name in self.config.slots}
         if not self.reads(found):
             raise InvalidOptionError(
-                f"observation: a DeepRM network for slots {_counted(self.sizes.slots)} cannot read one with "
+                f"observation: a DeepRM network for slots {_counted(self.config.slots)} cannot read one with "
                 f"{_counted(found)}; every scale needs a model of its own"
             )
         dtype = next(self.parameters()).dtype

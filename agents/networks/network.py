@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from marl_sched.agents.policies.cards import Sizes
+from marl_sched.agents.networks.registry import NetworkConfig
 from marl_sched.graph import ACTION_MASK, ArraySpec, GraphSpec
 
 
@@ -21,12 +21,17 @@ class PolicyNetwork(nn.Module, ABC):
         permutation_equivariant: whether permuting a type's nodes permutes the logits and no weight depends on how
             many there are, so that hidden nodes may be cut out of an observation.
         spec: the metagraph that it was made for.
-        sizes: of its layers, as its card holds them.
+        config: its sizes, from which an untrained network like it can be built.
     """
 
     permutation_equivariant: ClassVar[bool]
     spec: GraphSpec
-    sizes: Sizes
+    config: NetworkConfig
+
+    @property
+    def sizes(self) -> dict[str, Any]:
+        """What its card holds of its sizes."""
+        return self.config.as_card()
 
     def weights(self) -> Any:
         """What can be prepared once for many forward passes with fixed parameters; here nothing."""

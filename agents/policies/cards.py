@@ -28,32 +28,6 @@ Mode = Literal["greedy", "sample", "one_pass"]  # see marl_sched.agents.policies
 _ARCHITECTURE = "architecture"
 
 
-class HetGATSizes(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field=_ARCHITECTURE, tag="hetgat"):
-    """Sizes of a HetGAT network: features per head, heads per layer, layers."""
-
-    width: Width
-    heads: Heads
-    layers: Layers
-
-
-class DecimaSizes(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field=_ARCHITECTURE, tag="decima"):
-    """Sizes of Decima's networks f, g and q: features of a layer, layers of each."""
-
-    hidden: Width
-    layers: Layers
-
-
-class DeepRMSizes(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field=_ARCHITECTURE, tag="deeprm"):
-    """Sizes of a DeepRM network: features of a layer, layers, and the slots of every node type that it reads."""
-
-    hidden: Width
-    layers: Layers
-    slots: dict[str, Slots]
-
-
-Sizes = HetGATSizes | DecimaSizes | DeepRMSizes
-
-
 class PolicyCard(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What the weights beside it are.
 
@@ -62,7 +36,7 @@ class PolicyCard(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         objective: the reward it was trained for.
         view: what an agent saw in training: `{"kind": "local", "reach": 1, ...}`.
         graph: node types with the names of their features, relations, and what is decided on.
-        sizes: of the network, whose class says what its architecture is.
+        sizes: of the network, `{"architecture": NAME, ...}`; marl_sched.agents.networks.registry reads them.
         command: the exact command that trained it.
         git_hash: the source that the command ran on, see `source_revision`.
         seed: of the training run.
@@ -78,7 +52,7 @@ class PolicyCard(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     objective: str
     view: dict[str, Any]
     graph: GraphSpec
-    sizes: Sizes
+    sizes: dict[str, Any]
     command: str
     git_hash: str
     seed: int
@@ -116,9 +90,6 @@ def read_card(path: str | Path) -> PolicyCard:
         _check_relation(path, f"graph.relations[{i}]", relation, [node.name for node in card.graph.nodes])
     keys = [relation.key for relation in card.graph.relations]
     _require_distinct(path, "graph.relations", keys)
-    names = sorted(node.name for node in card.graph.nodes)
-    if isinstance(card.sizes, DeepRMSizes) and sorted(card.sizes.slots) != names:
-        raise InvalidFileError(path, "sizes.slots", f"a number for each of {names}", sorted(card.sizes.slots))
     return card
 
 

@@ -11,10 +11,10 @@ import torch
 from safetensors import SafetensorError
 from torch import Tensor
 
-from marl_sched.agents.networks.architectures import new_network
 from marl_sched.agents.networks.network import PolicyNetwork
+from marl_sched.agents.networks.registry import config_of_card
 from marl_sched.agents.policies.cards import PolicyCard, read_card, write_card
-from marl_sched.errors import InvalidFileError
+from marl_sched.errors import InvalidFileError, MarlSchedError
 from marl_sched.files import replacing
 
 
@@ -39,8 +39,14 @@ def load_network(path: str | Path) -> tuple[PolicyNetwork, PolicyCard]:
     """
     weights_path, card_path = Path(path).with_suffix(".safetensors"), Path(path).with_suffix(".json")
     card = read_card(card_path)
-    with torch.device("meta"):  # shapes without memory, until they are known to be those of the weights
-        network = new_network(card.graph, card.sizes)
+    try:
+        with torch.device("meta"):  # shapes without memory, until they are known to be those of the weights
+            network = config_of_card(card.sizes).build(card.graph)
+    except msgspec.ValidationError as error:
+        reason, _, where = str(error).partition(" - at `$.")
+        raise InvalidFileError(card_path, where.rstrip("`"), f"sizes of a network ({reason})") from error
+    except MarlSchedError as error:
+        raise InvalidFileError(card_path, "sizes", f"a registered network that fits its graph ({error})") from error
     weights = _read_weights(weights_path, card)
     expected = network.state_dict()
     for name in sorted(expected.keys() | weights.keys()):

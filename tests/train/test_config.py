@@ -8,7 +8,9 @@ import pytest
 from marl_sched.envs.airme.views import FullView, LocalView
 from marl_sched.errors import InvalidFileError, InvalidOptionError, UnknownNameError
 from marl_sched.files import write_json
-from marl_sched.train.config import RENAMED, GaeConfig, RunRecord, StepBaselineConfig, load_config, load_record
+from marl_sched.train.algorithms.critic import GaeConfig
+from marl_sched.train.algorithms.step_baseline import StepBaselineConfig
+from marl_sched.train.config import RENAMED, RunRecord, load_config, load_record
 
 
 def test_defaults_are_the_recipe_of_the_full_view():

@@ -14,9 +14,8 @@ from marl_sched.domain import get_domain
 from marl_sched.envs.airme.views import LocalView
 from marl_sched.envs.api.torchrl_env import SchedulingTorchRL
 from marl_sched.errors import InvalidOptionError
+from marl_sched.train.algorithms.imitation import Imitation, ImitationConfig, cross_entropy, expected_advantage
 from marl_sched.train.collect import InstanceSource, Rollout, SegmentCollector
-from marl_sched.train.config import ImitationConfig
-from marl_sched.train.imitation import Imitation, cross_entropy, expected_advantage
 from marl_sched.train.ppo import Sampler
 from marl_sched.train.run import train_from_overrides
 

@@ -13,11 +13,12 @@ from marl_sched.domain import get_domain
 from marl_sched.envs.airme.views import LocalView
 from marl_sched.envs.api.torchrl_env import SchedulingTorchRL
 from marl_sched.errors import InvalidOptionError
+from marl_sched.train.algorithms.critic import CriticEstimator, OwnTurns
+from marl_sched.train.algorithms.step_baseline import StepBaseline
 from marl_sched.train.collect import EpisodeCollector, InstanceSource, Rollout, SegmentCollector
-from marl_sched.train.config import PpoConfig
-from marl_sched.train.estimators import CriticEstimator, Estimate, OwnTurns, StepBaseline
+from marl_sched.train.estimators import Estimate
 from marl_sched.train.learner import PolicyGradient
-from marl_sched.train.ppo import Ppo, Sampler, importance_subsample, policy_loss, samples_of
+from marl_sched.train.ppo import Ppo, PpoConfig, Sampler, importance_subsample, policy_loss, samples_of
 
 CONFIG = PpoConfig(
     clip=0.2, epochs=2, minibatch=64, learning_rate=1e-3, final_learning_rate=0.0, entropy=0.01, final_entropy=0.0,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 import torch
@@ -18,9 +17,9 @@ from marl_sched.cli.app import run as run_command
 from marl_sched.domain import get_domain
 from marl_sched.envs.api.torchrl_env import SchedulingTorchRL
 from marl_sched.files import read_json, write_json
+from marl_sched.train.algorithms.step_baseline import StepBaseline
 from marl_sched.train.collect import EpisodeCollector, InstanceSource
-from marl_sched.train.config import HetGATConfig, RunRecord, load_config, load_record
-from marl_sched.train.estimators import StepBaseline
+from marl_sched.train.config import load_config
 from marl_sched.train.evaluation.evaluate import Settings, evaluate_scheduler
 from marl_sched.train.learner import PolicyGradient
 from marl_sched.train.ppo import Ppo, Sampler
@@ -133,16 +132,6 @@ def test_policies_have_the_dissertations_sizes():
     decima, deeprm = (load_config([f"policy={name}"]).policy for name in ("decima", "deeprm"))
     assert (decima.hidden, decima.layers) == (64, 3)
     assert (deeprm.hidden, deeprm.layers) == (64, 4)
-
-
-def test_a_run_from_before_there_were_other_architectures_is_read(tmp_path: Path):
-    record = RunRecord(config=load_config([]), overrides=[], revision="")
-    write_json(tmp_path / "config.json", content := msgspec.to_builtins(record))
-    del content["config"]["policy"]["name"]
-    del content["config"]["algorithm"]["critic"]["name"]
-    write_json(tmp_path / "old.json", content)
-    assert load_record(tmp_path / "old.json") == load_record(tmp_path / "config.json") == record
-    assert isinstance(record.config.policy, HetGATConfig)
 
 
 def test_a_policy_is_played_as_it_was_validated(tmp_path: Path):

@@ -12,11 +12,11 @@ from torch import Tensor, nn
 from marl_sched.agents.networks.hetgat.network import HetGATNetwork
 from marl_sched.domain import get_domain
 from marl_sched.envs.api.torchrl_env import SchedulingTorchRL
+from marl_sched.train.algorithms.state_value import TIME_LEFT, StateValue, StateValueBaseline, TimedEpisodes
 from marl_sched.train.collect import InstanceSource, Rollout
 from marl_sched.train.config import RunRecord, load_config
 from marl_sched.train.export import knowledge
 from marl_sched.train.ppo import Sampler, samples_of
-from marl_sched.train.state_value import TIME_LEFT, StateValue, StateValueBaseline, TimedEpisodes
 
 LENGTH = 20
 

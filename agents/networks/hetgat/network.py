@@ -9,12 +9,14 @@ from collections.abc import Collection, Iterable, Mapping
 from typing import cast
 
 import torch
+from msgspec import Struct
 from torch import Tensor, nn
 
 from marl_sched.agents.networks.hetgat.inputs import GraphInputs, read_graph
 from marl_sched.agents.networks.hetgat.layer import HetGATLayer, LayerWeights, Merge
 from marl_sched.agents.networks.network import PolicyNetwork, explore_at_first, mask_logits
-from marl_sched.agents.policies.cards import HetGATSizes
+from marl_sched.agents.networks.registry import NAME, NetworkConfig
+from marl_sched.agents.policies.cards import Heads, Layers, Width
 from marl_sched.graph import DECISION, STATE, GraphSpec
 
 EncoderWeights = tuple[LayerWeights, ...]
@@ -63,6 +65,20 @@ class HetGATEncoder(nn.Module):
         return nodes, graph
 
 
+class HetGATConfig(
+    NetworkConfig, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field=NAME, tag="hetgat"
+):
+    """Sizes of a HetGAT network: features per head, heads per layer, layers."""
+
+    width: Width
+    heads: Heads
+    layers: Layers
+
+    def build(self, graph: GraphSpec) -> HetGATNetwork:
+        """See NetworkConfig."""
+        return HetGATNetwork(graph, width=self.width, heads=self.heads, layers=self.layers)
+
+
 class HetGATNetwork(PolicyNetwork):
     """A policy's network: logits over the decision nodes.
 
@@ -72,12 +88,11 @@ class HetGATNetwork(PolicyNetwork):
     """
 
     permutation_equivariant = True
-    sizes: HetGATSizes
 
     def __init__(self, spec: GraphSpec, *, width: int = 8, heads: int = 4, layers: int = 3) -> None:
         super().__init__()
         self.spec = spec
-        self.sizes = HetGATSizes(width=width, heads=heads, layers=layers)
+        self.config = HetGATConfig(width=width, heads=heads, layers=layers)
         self.encoder = HetGATEncoder(spec, width=width, heads=heads, layers=layers, outputs=[DECISION])
         self.readout = nn.Linear(width, 1)
         explore_at_first(self.readout)

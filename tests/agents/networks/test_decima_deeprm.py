@@ -9,12 +9,12 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from marl_sched.agents.networks.architectures import new_network
-from marl_sched.agents.networks.decima import DecimaNetwork
-from marl_sched.agents.networks.deeprm import DeepRMNetwork
-from marl_sched.agents.networks.hetgat.network import HetGATNetwork
+from marl_sched.agents.networks.decima import DecimaConfig, DecimaNetwork
+from marl_sched.agents.networks.deeprm import DeepRMConfig, DeepRMNetwork
+from marl_sched.agents.networks.hetgat.network import HetGATConfig, HetGATNetwork
 from marl_sched.agents.networks.network import PolicyNetwork
-from marl_sched.agents.policies.cards import DecimaSizes, DeepRMSizes, HetGATSizes, PolicyCard
+from marl_sched.agents.networks.registry import config_of_card
+from marl_sched.agents.policies.cards import PolicyCard
 from marl_sched.agents.policies.checkpoint import load_network, save_network
 from marl_sched.agents.policies.network_policy import NetworkPolicy
 from marl_sched.domain import domain_names, get_domain
@@ -191,10 +191,13 @@ def test_a_published_policy_comes_back_from_its_files_and_plays_every_domain(nam
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        ({"slots": {"plane": 9}}, r"sizes\.slots: expected a number for each of \['crew', 'plane'\], got \['plane'\]"),
+        (
+            {"slots": {"plane": 9}},
+            r"sizes: .*slots: expected a number for each of \['crew', 'plane'\], got \['plane'\]",
+        ),
         ({"slots": {"plane": 9, "crew": 0}}, r"sizes\.slots.*`int` >= 1"),
         ({"slots": {"plane": 8, "crew": 4}}, r"stack\.0\.weight: expected torch.float32 of shape"),
-        ({"architecture": "alexnet"}, r"sizes\.architecture: .*Invalid value 'alexnet'"),
+        ({"architecture": "alexnet"}, r"sizes: .*unknown network 'alexnet'. Known: decima, deeprm, hetgat"),
         ({"architecture": "decima"}, r"sizes: .*unknown field `slots`"),
     ],
 )
@@ -215,11 +218,11 @@ def test_a_card_that_does_not_fit_its_weights_is_refused(damage, message: str, f
 def test_every_architecture_is_made_from_its_sizes(fleet):
     slots = {"plane": 9, "crew": 4}
     for sizes, kind in (
-        (HetGATSizes(width=4, heads=2, layers=1), HetGATNetwork),
-        (DecimaSizes(hidden=4, layers=2), DecimaNetwork),
-        (DeepRMSizes(hidden=4, layers=2, slots=slots), DeepRMNetwork),
+        (HetGATConfig(width=4, heads=2, layers=1), HetGATNetwork),
+        (DecimaConfig(hidden=4, layers=2), DecimaNetwork),
+        (DeepRMConfig(hidden=4, layers=2, slots=slots), DeepRMNetwork),
     ):
-        network = new_network(fleet, sizes)
+        network = sizes.build(fleet)
         assert type(network) is kind
-        assert network.sizes == sizes
+        assert config_of_card(network.sizes) == sizes
         assert network.permutation_equivariant == (kind is not DeepRMNetwork)

@@ -9,18 +9,54 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import torch
+from msgspec import Struct
 from torch import Tensor, nn
 
-from marl_sched.agents.networks.hetgat.network import HetGATCritic
+from marl_sched.agents.networks.hetgat.network import HetGATConfig, HetGATCritic
 from marl_sched.graph import GraphSpec
 from marl_sched.train.advantages import returns_by_time
-from marl_sched.train.collect import Act, EpisodeCollector, Rollout
+from marl_sched.train.algorithms.base import NAME, AlgorithmConfig, Setup
+from marl_sched.train.bounds import Count, Share
+from marl_sched.train.collect import Act, Collector, EpisodeCollector, Rollout
+from marl_sched.train.device import pick_device
 from marl_sched.train.estimators import Estimate, explained_variance, values_of
+from marl_sched.train.learner import Learner, PolicyGradient
+from marl_sched.train.ppo import Ppo, PpoConfig
+
+if TYPE_CHECKING:
+    from marl_sched.train.config import TrainConfig
 
 TIME_LEFT = "time_left"
 _UNIT = 100.0  # of the time left and of values, so that a network meets numbers around 1
+
+
+class StateValueConfig(
+    AlgorithmConfig, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field=NAME, tag="state_value"
+):
+    """Whole episodes as `step_baseline` plays them, with a critic on the state node as baseline (section 6.5.4)."""
+
+    instances: Count
+    episodes: Count
+    discount: Share
+    critic: HetGATConfig
+    ppo: PpoConfig
+
+    def build(self, setup: Setup) -> tuple[Collector, Learner]:
+        """See AlgorithmConfig."""
+        env = setup.environment(rows=self.instances * self.episodes, episodes=self.episodes)
+        sizes = self.critic
+        critic = StateValue(env.simulator.graph, width=sizes.width, heads=sizes.heads, layers=sizes.layers)
+        critic = critic.to(pick_device(setup.config.device))
+        estimator = StateValueBaseline(critic, discount=self.discount)
+        learner = PolicyGradient(Ppo(setup.policy(env), critic, self.ppo), estimator)
+        return TimedEpisodes(env, central=False), learner
+
+    def knowledge(self, config: TrainConfig) -> list[str]:
+        """The critic's."""
+        return ["a critic that is told the time left"]
 
 
 class StateValue(nn.Module):

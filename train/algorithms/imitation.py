@@ -14,21 +14,77 @@ sum over a of pi(a) A(a) + temperature x entropy (AggreVaTeD; Sun et al. 2017).
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Annotated, Literal
+
 import numpy as np
 import torch
+from msgspec import Meta, Struct
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from marl_sched.agents.base import AdvantageScheduler
+from marl_sched.agents.base import AdvantageScheduler, PrivilegedInfo
 from marl_sched.agents.networks.network import PolicyNetwork
+from marl_sched.agents.registry import create_scheduler
 from marl_sched.errors import InvalidOptionError
 from marl_sched.graph import ACTION_MASK
-from marl_sched.train.collect import Rollout
-from marl_sched.train.config import ImitationConfig
+from marl_sched.train.algorithms.base import NAME, AlgorithmConfig, Setup
+from marl_sched.train.bounds import Count, NonNegative, Positive
+from marl_sched.train.collect import Collector, Rollout
 from marl_sched.train.device import device_of
+from marl_sched.train.learner import Learner
 from marl_sched.train.ppo import between, importance_subsample, means, minibatches
 
+if TYPE_CHECKING:
+    from marl_sched.train.config import TrainConfig
+
 LEAST = -10.0  # no choice counts as worse than this, in units of what the best choice is usually worth
+
+
+class ImitationConfig(
+    AlgorithmConfig, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field=NAME, tag="imitation"
+):
+    """Choices scored by a scheduler that knows more; temperature and learning rate change linearly.
+
+    `criterion` is what is optimised: see the module's page.
+
+    Rows play on from update to update, `turns` turns each, with the policy that learns.
+    """
+
+    instances: Count
+    turns: Count
+    teacher: str
+    criterion: Literal["cross_entropy", "expected_advantage"]
+    epochs: Count
+    minibatch: Count
+    learning_rate: Positive
+    final_learning_rate: NonNegative
+    temperature: Positive
+    final_temperature: Positive
+    max_grad_norm: Positive
+    min_keep_prob: Annotated[float, Meta(gt=0, le=1)]
+
+    def build(self, setup: Setup) -> tuple[Collector, Learner]:
+        """See AlgorithmConfig; raises InvalidOptionError for a scheduler that cannot teach."""
+        teacher = create_scheduler(self.teacher, setup.config.env.name)
+        if not isinstance(teacher, AdvantageScheduler):
+            raise InvalidOptionError(
+                f"train: algorithm.teacher: expected a scheduler that can tell how good every choice is, "
+                f"got {self.teacher}"
+            )
+        if PrivilegedInfo.TIME_LEFT in teacher.privileged_info:  # training episodes are cut before the end it plans for
+            raise InvalidOptionError(
+                f"train: algorithm.teacher: expected a scheduler that does not heed the time left, got {self.teacher}"
+            )
+        collector = setup.segments(rows=self.instances, turns=self.turns, central=setup.hides)
+        teacher.start(collector.env.simulator, np.ones(collector.env.simulator.batch, np.bool_))
+        return collector, Imitation(setup.policy(collector.env), teacher, self)
+
+    def knowledge(self, config: TrainConfig) -> list[str]:
+        """The teacher's, and what it is shown."""
+        teacher = create_scheduler(self.teacher, config.env.name)
+        known = f" ({teacher.privileged_info})" if teacher.privileged_info else ""
+        shown = ["the full graph for the teacher"] if config.make_view().hides else []
+        return [f"imitation of {teacher.name}{known}", *shown]
 
 
 class Imitation:
