@@ -181,7 +181,7 @@ def _registered(kind: type, content: Any) -> Any:
     """Msgspec's hook for the groups whose struct a registry has."""
     if not isinstance(content, dict):
         raise TypeError(f"expected a group of settings, got {content!r}")
-    return {NetworkConfig: network_config, AlgorithmConfig: algorithm_config}[kind](content)
+    return network_config(content) if kind is NetworkConfig else algorithm_config(content)
 
 
 def _checked(config: TrainConfig) -> TrainConfig:

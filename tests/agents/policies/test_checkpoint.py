@@ -130,7 +130,7 @@ def test_a_malformed_card_names_the_field(saved, change, message: str):
     card = saved.with_suffix(".json")
     card.write_text(json.dumps({**json.loads(card.read_text()), **change}))
     with pytest.raises(InvalidFileError, match=message):
-        read_card(card)
+        load_network(saved)
 
 
 def decide_on_nothing(card):
