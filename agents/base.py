@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from enum import Flag, auto
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -47,6 +47,16 @@ _IN_WORDS = {
 }
 
 
+class EpochPlayer(Protocol):
+    """Plays whole decision epochs in one compiled call; the choices are those that turns would make."""
+
+    def __call__(self, count: int) -> tuple[float, int]:
+        """Play up to `count` decision epochs in every row that is not over.
+
+        Returns the sum over all decisions of the visible share of the deciding agent's graph, and their number.
+        """
+
+
 class Scheduler(ABC):
     """Chooses actions for acting agents.
 
@@ -74,6 +84,13 @@ class Scheduler(ABC):
     def decide(self, simulator: TurnSimulator) -> np.ndarray:
         """Actions int64 (B,) for the acting agents; rows that are over get 0."""
 
+    def epoch_player(self, simulator: TurnSimulator) -> EpochPlayer | None:
+        """What plays this scheduler's decision epochs on a simulator, which it is started on, in compiled code.
+
+        None where a scheduler has none: then it takes turns. Either way the simulator goes through the same states.
+        """
+        return None
+
 
 class ObservationScheduler(Scheduler):
     """A scheduler that needs only the acting agent's observation and, to sample, one uniform.
@@ -90,8 +107,12 @@ class ObservationScheduler(Scheduler):
 
     def decide(self, simulator: TurnSimulator) -> np.ndarray:
         """Observe for every acting agent under the simulator's view, then choose."""
-        agents = simulator.acting
-        return self.choose(simulator.observe(agents), simulator.policy_noise(agents))
+        rows, observation = simulator.observe_acting()
+        noise = simulator.policy_noise(simulator.acting)[rows] if self.samples else np.zeros(len(rows))
+        actions = np.zeros(simulator.batch, np.int64)
+        if len(rows):
+            actions[rows] = self.choose(observation, noise)
+        return actions
 
     def act(self, observation: Mapping[str, np.ndarray], uniform: float | None = None) -> int:
         """One agent's choice from its own observation without batch axis, as PettingZoo gives it.

@@ -20,6 +20,7 @@ from marl_sched.graph import ACTION_MASK, ArraySpec, GraphSpec
 from marl_sched.noise import Stream, uniforms
 
 Observation = dict[str, np.ndarray]
+_POLICY = int(Stream.POLICY)  # a compiled function takes fifteen times as long to recognise an IntEnum
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,7 @@ class TurnSimulator(ABC):
     episode_keys: np.ndarray
     graph: GraphSpec
     arrays: Mapping[str, ArraySpec]
+    _observed: Observation | None = None  # the arrays of observe_acting
 
     @abstractmethod
     def reset(
@@ -114,6 +116,19 @@ class TurnSimulator(ABC):
     @abstractmethod
     def observe_all(self) -> Observation:
         """The graph under the full view with row's acting agent: the centralised information pattern."""
+
+    def observe_acting(self) -> tuple[np.ndarray, Observation]:
+        """What acting agents see: the rows that are not over, int64 (N,), and arrays of an observation with B = N.
+
+        The arrays are the simulator's own and hold until the next call.
+        """
+        if self._observed is None:
+            self._observed = self.new_observation()
+        rows = np.flatnonzero(self.acting >= 0)
+        observation = self.observe(self.acting, self._observed)
+        if len(rows) < self.batch:
+            observation = {name: values[rows] for name, values in observation.items()}
+        return rows, observation
 
     @abstractmethod
     def free_agents(self, row: int) -> np.ndarray:
@@ -199,7 +214,7 @@ class TurnSimulator(ABC):
 
     def policy_noise(self, agents: np.ndarray, draw: int = 0) -> np.ndarray:
         """The uniform, float64 (B,), with which a sampling policy picks for these agents at this decision epoch."""
-        return uniforms(self.episode_keys, self.time, Stream.POLICY, np.maximum(agents, 0), draw)
+        return uniforms(self.episode_keys, self.time, _POLICY, np.maximum(agents, 0), draw)
 
     @property
     def over(self) -> np.ndarray:

@@ -1,71 +1,58 @@
-"""Rules for AirME (dissertation, section 6.5.1), each a function of one crew's observation.
+"""Rules for AirME (dissertation, section 6.5.1): what a crew does with what it sees.
 
 A crew serves the best plane that it sees and that nobody has in hand. Under the full view, with crews acting
 in turn, that is the same as handing the free crews the head of a priority queue, which is how the
-dissertation puts it. Rules may recall flying planes.
+dissertation puts it. Rules may recall flying planes. How planes are ranked stands in
+marl_sched.agents.airme.ranking.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import cast
 
 import numpy as np
 
+from marl_sched.agents.airme import ranking
 from marl_sched.agents.airme.bound.index import require_types
+from marl_sched.agents.airme.epochs import EpochPlayer
+from marl_sched.agents.airme.ranking import N_FEATURES, Ranking
 from marl_sched.agents.base import ObservationScheduler, PrivilegedInfo, best_action
 from marl_sched.envs.airme.aircraft import PUBLISHED_TYPES, AircraftType, FailureModel, failure_table
-from marl_sched.envs.airme.graph import graph_spec
 from marl_sched.envs.airme.simulator import AirmeSimulator
 from marl_sched.errors import InvalidOptionError
 from marl_sched.simulation import TurnSimulator
 
 Observation = Mapping[str, np.ndarray]
-_FIRST = 1e9  # added to scores of planes that go before all others
 _PERIOD = 6  # hours, periodic
 _HOURS_THRESHOLD = 40.0  # condition-based
 _FAILURE_THRESHOLD = 0.004  # model-based
 _PREVENTIVE_HOURS, _PREVENTIVE_LANDINGS = 45.0, 4.0
-
-
-def _column(name: str) -> int:
-    return graph_spec(0).node("plane").features.index(name)
-
-
-_HOURS, _LANDINGS, _INCOME = _column("hours/10"), _column("landings/5"), _column("income/10")
-_BROKEN, _FIRST_TYPE = _column("broken"), len(graph_spec(0).node("plane").features)
-
-
-class _Fleet:
-    """The planes of an observation in their own units: every field (B, P + 1)."""
-
-    def __init__(self, observation: Observation) -> None:
-        plane = np.asarray(observation["plane"], np.float64)
-        self.hours = np.rint(plane[..., _HOURS] * 10)
-        self.landings = np.rint(plane[..., _LANDINGS] * 5)
-        self.income = plane[..., _INCOME] * 10
-        self.broken = plane[..., _BROKEN] > 0
-        self.types = plane[..., _FIRST_TYPE:]  # (B, P + 1, n_types), one-hot
-        self.open = np.asarray(observation["action_mask"]) > 0
-        self.open[:, 0] = False  # the null plane is what remains
+_NO_FAILURES = np.zeros((1, 1, 1))
 
 
 class PriorityRule(ObservationScheduler):
-    """Serve the open plane of the highest priority; `priority` gives -inf to planes that are not to be served."""
+    """Serve the open plane of the highest rank."""
 
     heeds_objective = False
 
-    def __init__(
-        self, name: str, priority: Callable[[_Fleet], np.ndarray], privileged_info: PrivilegedInfo = PrivilegedInfo.NONE
-    ) -> None:
-        self.name, self.privileged_info, self._priority = name, privileged_info, priority
+    def __init__(self, name: str, ranking: Ranking, privileged_info: PrivilegedInfo = PrivilegedInfo.NONE) -> None:
+        self.name, self.privileged_info, self.ranking = name, privileged_info, ranking
 
     def choose(self, observation: Observation, uniform: np.ndarray) -> np.ndarray:
         """Actions int64 (B,); `uniform` is not used."""
-        fleet = _Fleet(observation)
-        priority = self._priority(fleet)
-        return best_action(priority, fleet.open & (priority > -np.inf))
+        failure = self._failures(observation["plane"])
+        ranks = ranking.rank_observation(observation, failure, self.ranking)
+        return best_action(ranks, ranks > self.ranking.least)
+
+    def epoch_player(self, simulator: TurnSimulator) -> EpochPlayer:
+        """What plays this rule's decision epochs in one call."""
+        return EpochPlayer(cast(AirmeSimulator, simulator), self.ranking)
+
+    def _failures(self, plane: np.ndarray) -> np.ndarray:
+        """Failure probabilities float64 (n_types, n_parts, longest + 1) that cover an observation's planes."""
+        return _NO_FAILURES
 
 
 class RandomRule(ObservationScheduler):
@@ -88,33 +75,22 @@ class PeriodicRule(PriorityRule):
     def __init__(self, period: int = _PERIOD) -> None:
         if period < 1:
             raise InvalidOptionError(f"periodic: period: expected at least 1 hour, got {period}")
-        super().__init__("periodic", lambda fleet: np.where(fleet.broken, _FIRST + fleet.income, fleet.hours))
-        self._period = period
-
-    def choose(self, observation: Observation, uniform: np.ndarray) -> np.ndarray:
-        """Actions int64 (B,), 0 between periods."""
-        due = np.asarray(observation["time"]) % self._period == 0
-        return np.where(due, super().choose(observation, uniform), 0)
+        super().__init__("periodic", ranking.ranking(ranking.PERIODIC, period=period))
 
 
 def corrective() -> PriorityRule:
     """Broken planes by hourly income."""
-    return PriorityRule("corrective", lambda fleet: np.where(fleet.broken, fleet.income, -np.inf))
+    return PriorityRule("corrective", ranking.ranking(ranking.CORRECTIVE))
 
 
 def corrective_as_published() -> PriorityRule:
     """Broken planes in plane order, as the published code runs it."""
-    return PriorityRule("corrective-published", lambda fleet: np.where(fleet.broken, 0.0, -np.inf))
+    return PriorityRule("corrective-published", ranking.ranking(ranking.CORRECTIVE_AS_PUBLISHED))
 
 
 def condition(threshold: float = _HOURS_THRESHOLD) -> PriorityRule:
     """Broken planes by income, then unbroken ones with at least `threshold` operating hours, by hours."""
-
-    def priority(fleet: _Fleet) -> np.ndarray:
-        worn = np.where(fleet.hours >= threshold, fleet.hours, -np.inf)
-        return np.where(fleet.broken, _FIRST + fleet.income, worn)
-
-    return PriorityRule("condition", priority)
+    return PriorityRule("condition", ranking.ranking(ranking.CONDITION, hours=threshold))
 
 
 class ModelBasedRule(PriorityRule):
@@ -133,24 +109,22 @@ class ModelBasedRule(PriorityRule):
         types: Sequence[AircraftType] = PUBLISHED_TYPES,
         failure: FailureModel = "density",
     ) -> None:
-        super().__init__("model-based", self._by_risk, privileged_info=PrivilegedInfo.FAILURE_MODEL)
-        self._threshold, self._types, self._failure = threshold, tuple(types), failure
+        super().__init__(
+            "model-based",
+            ranking.ranking(ranking.MODEL_BASED, risk=threshold),
+            privileged_info=PrivilegedInfo.FAILURE_MODEL,
+        )
+        self._types, self._failure = tuple(types), failure
 
     def start(self, simulator: TurnSimulator, rows: np.ndarray) -> None:
         """Know the simulator's types and failure model."""
         of = cast(AirmeSimulator, simulator)
         self._types, self._failure = of.types, of.failure
 
-    def _by_risk(self, fleet: _Fleet) -> np.ndarray:
-        require_types(self.name, fleet.types.shape[-1], self._types)
-        kind = (fleet.types @ np.arange(len(self._types))).astype(np.int64)
-        hours, landings = fleet.hours.astype(np.int64), fleet.landings.astype(np.int64)
-        table = _failure_table(self._types, self._failure, int(max(hours.max(), landings.max())).bit_length())
-        survival = np.ones_like(fleet.hours)
-        for part in range(table.shape[1]):
-            survival *= 1.0 - table[kind, part, landings if part == 0 else hours]
-        risk = 1.0 - survival
-        return np.where(fleet.broken, _FIRST + fleet.income, np.where(risk >= self._threshold, risk, -np.inf))
+    def _failures(self, plane: np.ndarray) -> np.ndarray:
+        require_types(self.name, plane.shape[-1] - N_FEATURES, self._types)
+        longest = int(max((plane[..., ranking.HOURS] * 10).max(), (plane[..., ranking.LANDINGS] * 5).max())) + 1
+        return _failure_table(self._types, self._failure, longest.bit_length())
 
 
 @lru_cache(maxsize=16)
@@ -161,14 +135,7 @@ def _failure_table(types: tuple[AircraftType, ...], failure: FailureModel, bits:
 def preventive_first(hours: float = _PREVENTIVE_HOURS, landings: float = _PREVENTIVE_LANDINGS) -> PriorityRule:
     """Worn planes before broken ones: it keeps the backlog of long repairs from eating the crews.
 
-    Fixed-wing planes (type 0) from `hours` operating hours and helicopters (type 1) from `landings` landings on
-    come first, by hours x income; broken planes follow, by income. Not in the dissertation.
+    Fixed-wing planes (type 0) from `hours` operating hours and all others from `landings` landings on come first, by
+    hours x income; broken planes follow, by income. Not in the dissertation.
     """
-
-    def priority(fleet: _Fleet) -> np.ndarray:
-        fixed_wing = fleet.types[..., 0] > 0
-        worn = np.where(fixed_wing, fleet.hours >= hours, fleet.landings >= landings)
-        preventive = np.where(worn, _FIRST + fleet.hours * fleet.income, -np.inf)
-        return np.where(fleet.broken, fleet.income, preventive)
-
-    return PriorityRule("preventive-first", priority)
+    return PriorityRule("preventive-first", ranking.ranking(ranking.PREVENTIVE_FIRST, hours=hours, landings=landings))

@@ -95,16 +95,13 @@ class NetworkPolicy(ObservationScheduler):
             if self.card is not None:
                 check_graph(f"{self.name}.json", self.card, simulator.graph)
             self._checked = simulator.graph
-        agents = simulator.acting
-        rows = np.flatnonzero(agents >= 0)
+        rows, observation = simulator.observe_acting()
         actions = np.zeros(simulator.batch, np.int64)
         if len(rows):
-            observation = simulator.observe(agents)
-            if len(rows) < simulator.batch:  # rows that are over would cost as much as the others
-                observation = {name: values[rows] for name, values in observation.items()}
             one_pass = self.mode == "one_pass"
             logits = self._of_epoch(simulator, rows, observation) if one_pass else self.logits(observation)
-            actions[rows] = self._pick(logits, simulator.policy_noise(agents)[rows])
+            noise = simulator.policy_noise(simulator.acting)[rows] if self.samples else np.zeros(len(rows))
+            actions[rows] = self._pick(logits, noise)
         return actions
 
     def _of_epoch(self, simulator: TurnSimulator, rows: np.ndarray, observation: Observation) -> np.ndarray:

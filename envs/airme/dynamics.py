@@ -189,15 +189,13 @@ def release(plane: Record, crews: np.ndarray) -> None:
 
 
 @njit(cache=True)
-def hour(
-    row: Record, planes: np.ndarray, crews: np.ndarray, usage: np.ndarray, failure: np.ndarray, status: np.ndarray
-) -> tuple[float, float, int, int]:
-    """One hour of one instance; returns (income, repair cost, planes available, planes broken).
+def hour(state: State, rules: Rules, b: int) -> tuple[float, float, int, int]:
+    """One hour of row b; returns (income, repair cost, planes available, planes broken).
 
-    row ROW, planes PLANE (P + 1,), crews CREW (C,) with their choices, usage float64 (n_types,), failure
-    float64 (n_types, parts, longest + 1), status uint8 (P + 1,) or (0,): what each plane did. Decisions apply
-    first and their hour is the first hour of repair.
+    Decisions apply first and their hour is the first hour of repair. What each plane did is noted where the state
+    records a timeline.
     """
+    row, planes, crews = state.rows[b], state.planes[b], state.crews[b]
     time_word = time_key(row.episode, row.time)
     for crew in range(row.n_crews):
         action = crews[crew].choice
@@ -219,13 +217,13 @@ def hour(
             crews[plane.crew].job_done = plane.job_done
             cost += plane.job_cost
         else:
-            fly(plane, slot, usage, failure, time_word)
+            fly(plane, slot, rules.usage, rules.failure, time_word)
             if plane.mission_hours > 0:
                 income += plane.income
             if not plane.broken:
                 available += 1
-        if status.shape[0] > 0:
-            status[slot] = _status(plane)
+        if state.timeline.shape[0] > 0:
+            state.timeline[b, row.time, slot] = _status(plane)
         release(plane, crews)
         if plane.broken:
             broken += 1
@@ -271,8 +269,7 @@ def decide(state: State, b: int, crew: int, action: int) -> None:
 def pass_hour(state: State, rules: Rules, b: int) -> None:
     """Let one hour pass in row b, keep the books, and see whether the episode ends."""
     row, t = state.rows[b], state.rows[b].time
-    status = state.timeline[b, t] if state.timeline.shape[0] > 0 else np.empty(0, np.uint8)
-    income, cost, available, broken = hour(row, state.planes[b], state.crews[b], rules.usage, rules.failure, status)
+    income, cost, available, broken = hour(state, rules, b)
     series = state.series[b, t]
     series[PROFIT] = (income - cost) / row.total_income
     series[REVENUE] = income / row.total_income
@@ -337,47 +334,71 @@ def require_consistent(state: State, rules: Rules, batch: int) -> None:
             raise ValueError("a row of this state runs on after its horizon")
 
 
+def pass_hours(state: State, rules: Rules, b: int) -> None:
+    """Let hours pass in row b, one at least, until a crew of it is free to act or the episode ends."""
+    row, following = state.rows[b], -1
+    while following < 0 and not row.terminated and not row.truncated:
+        if state.private_memory_at.shape[0] > 0:
+            pass_hour_with_memory(state, rules, b)
+        else:
+            pass_hour(state, rules, b)
+        following = next_free(state.crews[b], row.n_crews)
+    row.acting = -1 if row.terminated or row.truncated else following
+
+
 @njit(cache=True)
-def step(state: State, rules: Rules, actions: np.ndarray) -> None:
-    """Take a turn, int64 (B,), in every row that is not over and let hours pass until a crew of it is free."""
+def take_turn(state: State, rules: Rules, b: int, action: int) -> None:
+    """The acting crew of row b, which is not over, chooses; after the last one of the hour hours pass."""
+    row = state.rows[b]
+    begin_step(row)
+    decide(state, b, row.acting, action)
+    ends = rules.scheme == SINGLE or (rules.scheme == SKIP and action == IDLE)
+    following = -1 if ends else next_free(state.crews[b], row.n_crews)
+    if following < 0:
+        pass_hours(state, rules, b)
+    else:
+        row.acting = following
+
+
+@njit(cache=True)
+def step(state: State, rules: Rules, actions: np.ndarray) -> int:
+    """Take a turn, int64 (B,), in every row that is not over.
+
+    Returns the index of the first action that is not a slot, and then nothing was played, or -1.
+    """
     require_consistent(state, rules, actions.shape[0])
+    bad = first_outside(actions, state.planes.shape[1])
+    if bad >= 0:
+        return bad
     for b in range(actions.shape[0]):
-        row = state.rows[b]
-        begin_step(row)
-        if row.acting < 0:
-            continue
-        decide(state, b, row.acting, actions[b])
-        ends = rules.scheme == SINGLE or (rules.scheme == SKIP and actions[b] == IDLE)
-        following = -1 if ends else next_free(state.crews[b], row.n_crews)
-        while following < 0 and not row.terminated and not row.truncated:
-            if state.private_memory_at.shape[0] > 0:
-                pass_hour_with_memory(state, rules, b)
-            else:
-                pass_hour(state, rules, b)
-            following = next_free(state.crews[b], row.n_crews)
-        row.acting = -1 if row.terminated or row.truncated else following
+        if state.rows[b].acting >= 0:
+            take_turn(state, rules, b, actions[b])
+        else:
+            begin_step(state.rows[b])
+    return -1
 
 
 @njit(cache=True)
 def first_outside(actions: np.ndarray, n_actions: int) -> int:
-    """Index of the first of actions, int64 (N,), that is not in [0, n_actions), -1 if there is none.
-
-    Two reductions in NumPy would cost as much as an hour of a small fleet.
-    """
-    for i in range(actions.shape[0]):
-        if actions[i] < 0 or actions[i] >= n_actions:
+    """Flat index of the first of actions, int64 of any shape, that is not in [0, n_actions), -1 if there is none."""
+    flat = actions.ravel()
+    for i in range(flat.shape[0]):
+        if flat[i] < 0 or flat[i] >= n_actions:
             return i
     return -1
 
 
 @njit(cache=True)
-def play_hour(state: State, rules: Rules, choices: np.ndarray) -> None:
+def play_hour(state: State, rules: Rules, choices: np.ndarray) -> int:
     """Play one hour in every row that is not over, with an action for each crew, int64 (B, C).
 
     This is the centralised interface of section 6.2.4: actions of busy crews are ignored, impossible ones idle
-    the crew. Afterwards `acting` is the first free crew, -1 if all are busy.
+    the crew. Afterwards `acting` is the first free crew, -1 if all are busy. Returns as `step`.
     """
     require_consistent(state, rules, choices.shape[0])
+    bad = first_outside(choices, state.planes.shape[1])
+    if bad >= 0:
+        return bad
     for b in range(choices.shape[0]):
         row = state.rows[b]
         begin_step(row)
@@ -392,3 +413,4 @@ def play_hour(state: State, rules: Rules, choices: np.ndarray) -> None:
             pass_hour(state, rules, b)
         over = row.terminated or row.truncated
         row.acting = -1 if over else next_free(state.crews[b], row.n_crews)
+    return -1

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cache
 
 import numpy as np
 
+from marl_sched.compiled import entry
 from marl_sched.envs.airme import dynamics, graph
 from marl_sched.envs.airme.aircraft import FailureModel, failure_table
 from marl_sched.envs.airme.instance import SCALES, AirmeInstance
@@ -72,8 +74,8 @@ class AirmeSimulator(TurnSimulator):
             failure=np.zeros((len(self.types), 1, 0)),
             objective=dynamics.OBJECTIVES.index(objective),
             scheme=dynamics.SCHEMES.index(scheme),
-            horizon=horizon,
-            stop_share=stop_share or 0.0,
+            horizon=int(horizon),
+            stop_share=float(stop_share or 0.0),
         )
         self._link()
         self._seeds = np.zeros(self.batch, np.int64)
@@ -183,24 +185,24 @@ class AirmeSimulator(TurnSimulator):
 
     def step(self, actions: np.ndarray) -> None:
         """Take one turn in every row; see TurnSimulator.step."""
-        dynamics.step(self.state, self.rules, self._checked(actions, (self.batch,)))
+        self._play(_step(), actions, (self.batch,))
 
     def play_hour(self, choices: np.ndarray) -> None:
         """Play one hour in every row with an action for each crew, int64 (B, C), as in section 6.2.4.
 
         Actions of busy crews are ignored. Afterwards `acting` is -1 in rows whose crews are all busy.
         """
-        dynamics.play_hour(self.state, self.rules, self._checked(choices, (self.batch, self.max_agents)))
+        self._play(_play_hour(), choices, (self.batch, self.max_agents))
 
-    def _checked(self, actions: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-        actions = np.asarray(actions, np.int64)
+    def _play(self, kernel: Callable[..., int], actions: np.ndarray, shape: tuple[int, ...]) -> None:
+        """Hand actions to `step` or `play_hour`; IllegalActionError, and no change, for one that is no slot."""
+        actions = np.ascontiguousarray(actions, np.int64)
         if actions.shape != shape:
             raise IllegalActionError(f"actions: expected shape {shape}, got {actions.shape}")
-        outside = dynamics.first_outside(actions.ravel(), self.max_actions)
+        outside = kernel(self.state, self.rules, actions)
         if outside >= 0:
             bad = actions.ravel()[outside]
-            raise IllegalActionError(f"target {bad}: expected a plane's slot in [0, {self.max_actions - 1}]")
-        return actions
+            raise IllegalActionError(f"action {bad}: expected a plane's slot in [0, {self.max_actions - 1}]")
 
     def observe(self, agents: np.ndarray, out: Observation | None = None) -> Observation:
         """The graph each row's crew sees under the simulator's view; see TurnSimulator.observe."""
@@ -213,7 +215,7 @@ class AirmeSimulator(TurnSimulator):
     def _observe(self, agents: np.ndarray, limits: np.ndarray, out: Observation | None) -> Observation:
         out = self.new_observation() if out is None else out
         arrays = graph.Arrays(*[out[name] for name in graph.Arrays._fields])
-        graph.observe(self.state, self.rules.usage, np.asarray(agents, np.int64), limits, arrays)
+        graph.observe(self.state, self.rules.usage, np.ascontiguousarray(agents, np.int64), limits, arrays)
         return out
 
     def free_agents(self, row: int) -> np.ndarray:
@@ -245,3 +247,19 @@ def _new_state(batch: int, planes: int, crews: int, horizon: int, staleness: int
         private_memory=np.zeros(memory, dynamics.PLANE),
         private_memory_at=np.full(memory, -1, np.int64),
     )
+
+
+def example() -> tuple[dynamics.State, dynamics.Rules]:
+    """A state and rules of the types that those of every simulator have, to compile kernels for."""
+    rules = dynamics.Rules(np.zeros(1), np.zeros((1, 1, 1)), objective=0, scheme=0, horizon=1, stop_share=0.0)
+    return _new_state(1, 1, 1, 1, 0, timeline=False), rules
+
+
+@cache
+def _step() -> Callable[..., int]:
+    return entry(dynamics.step, *example(), np.zeros(1, np.int64))
+
+
+@cache
+def _play_hour() -> Callable[..., int]:
+    return entry(dynamics.play_hour, *example(), np.zeros((1, 1), np.int64))

@@ -16,6 +16,8 @@ from marl_sched.noise import Stream, uniforms
 Observations = dict[str, dict[str, Any]]
 Infos = dict[str, dict[str, Any]]
 
+_CONFLICT = int(Stream.CONFLICT)
+
 
 class SchedulingParallel(SchedulingEnvironment, ParallelEnv):
     """A domain as a PettingZoo Parallel environment, written by hand, not converted from AEC.
@@ -117,7 +119,7 @@ class SchedulingParallel(SchedulingEnvironment, ParallelEnv):
         best: dict[int, tuple[float, int]] = {}
         for agent, action in choices.items():
             if action > 0:
-                bid = (uniforms(keys, time, Stream.CONFLICT, np.array([action]), agent)[0], agent)
+                bid = (uniforms(keys, time, _CONFLICT, np.array([action]), agent)[0], agent)
                 best[action] = min(best.get(action, bid), bid)
         return {agent for agent, action in choices.items() if action > 0 and best[action][1] != agent}
 

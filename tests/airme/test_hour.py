@@ -211,7 +211,7 @@ class TestTurns:
     def test_action_outside_the_space_raises(self) -> None:
         simulator = AirmeSimulator([self.FLEET])
         for action in (-1, 5):
-            with pytest.raises(IllegalActionError, match=rf"target {action}: expected a plane's slot in \[0, 4\]"):
+            with pytest.raises(IllegalActionError, match=rf"action {action}: expected a plane's slot in \[0, 4\]"):
                 simulator.step(np.array([action]))
         with pytest.raises(IllegalActionError, match="expected shape"):
             simulator.step(np.array([0, 0]))

@@ -30,6 +30,7 @@ from marl_sched.statistics import Summary, paired_difference, percent_gain, summ
 SCHEMA = 1
 EXACT = "exact"  # the scheduler that the others' gap is taken to where it plays
 SHARE_EVERY = 8  # turns between two readings of the visible share
+EPOCHS_AT_ONCE = 24  # between two reports of progress, where a scheduler plays decision epochs in compiled code
 LOCAL_SHARE = 0.45  # a view that shows more of the graph than this is not called local
 _CHUNK_CELLS = 2048 * 41 * 16  # pairs of action and agent in flight: 2048 rows of a small AirME fleet, 288 of a large
 
@@ -132,6 +133,12 @@ def evaluate_scheduler(
         simulator = settings.simulator(domain, chosen, **own_options(scheduler, settings))
         simulator.reset(seed=settings.seed, episodes=[row % settings.episodes for row in rows])
         scheduler.start(simulator, np.ones(simulator.batch, np.bool_))
+        player = scheduler.epoch_player(simulator)
+        while player is not None and (simulator.acting >= 0).any():
+            seen, decisions = player(EPOCHS_AT_ONCE)
+            shares, turns = shares + seen, turns + decisions
+            if progress is not None:
+                progress((rows.start + len(rows) * _played(simulator)) / total)
         for turn in count():
             acting = simulator.acting >= 0
             if not acting.any():

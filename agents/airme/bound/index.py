@@ -16,7 +16,6 @@ from collections.abc import Mapping, Sequence
 from typing import cast
 
 import numpy as np
-from numba import njit
 
 from marl_sched.agents.airme.bound.plane import (
     BROKEN,
@@ -27,9 +26,10 @@ from marl_sched.agents.airme.bound.plane import (
     plane_model,
     reward_of,
 )
+from marl_sched.agents.airme.epochs import EpochPlayer
+from marl_sched.agents.airme.ranking import INDEX, N_FEATURES, IndexTables, Ranking, rank_observation, ranking
 from marl_sched.agents.base import AdvantageScheduler, PrivilegedInfo
 from marl_sched.envs.airme.aircraft import PUBLISHED_TYPES, AircraftType, FailureModel
-from marl_sched.envs.airme.graph import graph_spec
 from marl_sched.envs.airme.simulator import DEFAULT_HORIZON, AirmeSimulator
 from marl_sched.errors import InvalidOptionError
 from marl_sched.simulation import TurnSimulator
@@ -38,10 +38,7 @@ INCOMES = 5  # nodes between which indices are interpolated
 # Hours before the end at which indices are computed: the farther off the end, the less it matters.
 BEFORE_END = (1, 2, 4, 6, 8, 12, 16, 20, 24, 30, 36, 42, 48, 56, 64, 72, 84, 96, 120, 160, 200, 240)
 FAR_FROM_THE_END = 360
-_FEATURES = graph_spec(0).node("plane").features
-_HOURS, _LANDINGS, _INCOME, _BROKEN, _MISSION, _DONE = map(
-    _FEATURES.index, ("hours/10", "landings/5", "income/10", "broken", "mission_hours/10", "mission_done/10")
-)
+_NO_FAILURES = np.zeros((1, 1, 1))
 
 
 class IndexScheduler(AdvantageScheduler):
@@ -71,14 +68,14 @@ class IndexScheduler(AdvantageScheduler):
         )
         self._clock = clock
         self._problem = (objective, horizon, tuple(types), failure)
-        self._tables: _Tables | None = None
+        self._ranking: Ranking | None = None
 
     def start(self, simulator: TurnSimulator, rows: np.ndarray) -> None:
         """Plan for the simulator's objective, horizon, types and failure model."""
         of = cast(AirmeSimulator, simulator)
         problem = (of.objective, of.horizon, of.types, of.failure)
         if problem != self._problem:
-            self._problem, self._tables = problem, None
+            self._problem, self._ranking = problem, None
 
     def choose(self, observation: Mapping[str, np.ndarray], uniform: np.ndarray) -> np.ndarray:
         """Actions int64 (B,); `uniform` is not used."""
@@ -89,12 +86,19 @@ class IndexScheduler(AdvantageScheduler):
 
         0 for doing nothing, -inf for an action that is not legal or whose plane will not fail any more.
         """
-        require_types(self.name, observation["plane"].shape[-1] - len(_FEATURES), self._problem[2])
-        if self._tables is None:
-            self._tables = _Tables(*self._problem, clock=self._clock)
-        gains = np.where(np.asarray(observation["action_mask"]) > 0, self._tables.indices(observation), -np.inf)
+        require_types(self.name, observation["plane"].shape[-1] - N_FEATURES, self._problem[2])
+        gains = rank_observation(observation, _NO_FAILURES, self._plan())
         gains[:, 0] = 0.0
         return gains
+
+    def epoch_player(self, simulator: TurnSimulator) -> EpochPlayer:
+        """What plays this scheduler's decision epochs in one call."""
+        return EpochPlayer(cast(AirmeSimulator, simulator), self._plan())
+
+    def _plan(self) -> Ranking:
+        if self._ranking is None:
+            self._ranking = ranking(INDEX, least=0.0, tables=index_tables(*self._problem, clock=self._clock))
+        return self._ranking
 
 
 def require_types(scheduler: str, seen: int, types: Sequence[AircraftType]) -> None:
@@ -106,36 +110,28 @@ def require_types(scheduler: str, seen: int, types: Sequence[AircraftType]) -> N
         )
 
 
-class _Tables:
+def index_tables(
+    objective: str, horizon: int, types: Sequence[AircraftType], failure: FailureModel, *, clock: bool
+) -> IndexTables:
     """Indices of all types on a grid of hours, incomes and states.
 
     More than FAR_FROM_THE_END hours before the end an index no longer depends on the hour, so that the induction
     starts there.
     """
-
-    def __init__(
-        self, objective: str, horizon: int, types: tuple[AircraftType, ...], failure: FailureModel, *, clock: bool
-    ) -> None:
-        length = min(horizon, FAR_FROM_THE_END)
-        before_end = [hour for hour in (*BEFORE_END, length) if hour <= length] if clock else [length]
-        hours = np.unique(length - np.array(before_end))
-        self.hours = hours + (horizon - length)
-        nodes = 1 if objective == "availability" else INCOMES
-        self.incomes = np.array([np.geomspace(*kind.income, nodes) for kind in types])
-        states = (BROKEN + 1, LANDINGS_CAP + 1, HOURS_CAP + 1)
-        self.values = np.zeros((len(types), nodes, len(hours), *states), np.float32)
-        models = [plane_model(kind, failure, *_usual_starts()) for kind in types]
-        self.first, self.last = np.array([m.first for m in models]), np.array([m.last for m in models])
-        for k, model in enumerate(models):
-            for node, income in enumerate(self.incomes[k]):
-                reward = Reward(*map(float, reward_of(objective, float(income))))
-                index_slices(model, reward, np.zeros(length), hours, self.values[k, node])
-
-    def indices(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Every plane's index, float64 (B, P + 1), -inf where there is none."""
-        plane = np.asarray(observation["plane"], np.float64)
-        time = np.asarray(observation["time"], np.float64)
-        return _interpolate(self.values, self.incomes, self.hours, self.first, self.last, time, plane)
+    length = min(horizon, FAR_FROM_THE_END)
+    before_end = [hour for hour in (*BEFORE_END, length) if hour <= length] if clock else [length]
+    hours = np.unique(length - np.array(before_end))
+    nodes = 1 if objective == "availability" else INCOMES
+    incomes = np.array([np.geomspace(*kind.income, nodes) for kind in types])
+    states = (BROKEN + 1, LANDINGS_CAP + 1, HOURS_CAP + 1)
+    values = np.zeros((len(types), nodes, len(hours), *states), np.float32)
+    models = [plane_model(kind, failure, *_usual_starts()) for kind in types]
+    for k, model in enumerate(models):
+        for node, income in enumerate(incomes[k]):
+            reward = Reward(*map(float, reward_of(objective, float(income))))
+            index_slices(model, reward, np.zeros(length), hours, values[k, node])
+    first, last = np.array([m.first for m in models]), np.array([m.last for m in models])
+    return IndexTables(values, incomes, hours + (horizon - length), first, last)
 
 
 def _usual_starts() -> tuple[np.ndarray, np.ndarray]:
@@ -143,58 +139,3 @@ def _usual_starts() -> tuple[np.ndarray, np.ndarray]:
     pairs = [(h, n) for h in range(121) for n in range(max(0, h // 10 - 2), h // 5 + 3)]
     starts = np.array(pairs, np.int64).T
     return starts[0], starts[1]
-
-
-@njit(cache=True)
-def _between(nodes: np.ndarray, x: float) -> tuple[int, float]:
-    """Index of the node below x and the share of the next one, within the ends of `nodes` float64 (N,)."""
-    below = 0
-    while below < nodes.shape[0] - 2 and nodes[below + 1] <= x:
-        below += 1
-    if nodes.shape[0] == 1:
-        return 0, 0.0
-    share = (x - nodes[below]) / (nodes[below + 1] - nodes[below])
-    return below, min(max(share, 0.0), 1.0)
-
-
-@njit(cache=True)
-def _interpolate(
-    values: np.ndarray,
-    incomes: np.ndarray,
-    hours: np.ndarray,
-    first: np.ndarray,
-    last: np.ndarray,
-    time: np.ndarray,
-    plane: np.ndarray,
-) -> np.ndarray:
-    """Indices float64 (B, P + 1) from tables float32 (K, J, S, 11, L + 1, H + 1) and features (B, P + 1, F).
-
-    Counters that no plane of the generator can reach take those of the nearest that can, int64 (K, L + 1).
-    """
-    out = np.full(plane.shape[:2], -np.inf)
-    for b in range(plane.shape[0]):
-        s, later = _between(hours, time[b])
-        for slot in range(1, plane.shape[1]):
-            features = plane[b, slot]
-            kind = -1
-            for k in range(incomes.shape[0]):
-                if features[len(_FEATURES) + k] > 0:
-                    kind = k
-            if kind < 0:
-                continue
-            worn, landings = round(features[_HOURS] * 10), round(features[_LANDINGS] * 5)
-            state = round((features[_MISSION] - features[_DONE]) * 10)
-            if features[_BROKEN] > 0:
-                state = BROKEN
-            elif worn > HOURS_CAP or landings > LANDINGS_CAP:
-                continue
-            landings = min(landings, LANDINGS_CAP)
-            worn = min(max(worn, first[kind, landings]), last[kind, landings])
-            j, more = _between(incomes[kind], features[_INCOME] * 10)
-            total = 0.0
-            for dj in range(min(2, incomes.shape[1])):
-                for ds in range(min(2, hours.shape[0])):
-                    share = (more if dj else 1.0 - more) * (later if ds else 1.0 - later)
-                    total += share * values[kind, j + dj, s + ds, state, landings, worn]
-            out[b, slot] = total
-    return out
