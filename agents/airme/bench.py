@@ -13,7 +13,6 @@ from marl_sched.domain import Domain
 from marl_sched.envs.airme.aircraft import PUBLISHED_TYPES
 from marl_sched.envs.airme.instance import AirmeInstance
 
-
 RULE_HOURS = 240  # of an episode in which a rule decides
 
 
