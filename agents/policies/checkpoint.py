@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import safetensors.torch
 import torch
 from safetensors import SafetensorError
-from torch import Tensor
+from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
 
 from marl_sched.agents.networks.network import PolicyNetwork
 from marl_sched.agents.networks.registry import config_of_card
@@ -40,7 +43,8 @@ def load_network(path: str | Path) -> tuple[PolicyNetwork, PolicyCard]:
     weights_path, card_path = Path(path).with_suffix(".safetensors"), Path(path).with_suffix(".json")
     card = read_card(card_path)
     try:
-        with torch.device("meta"):  # shapes without memory, until they are known to be those of the weights
+        # shapes without memory, until they are known to be those of the weights
+        with torch.device("meta"), _Undrawn():
             network = config_of_card(card.sizes).build(card.graph)
     except msgspec.ValidationError as error:
         reason, _, where = str(error).partition(" - at `$.")
@@ -55,6 +59,18 @@ def load_network(path: str | Path) -> tuple[PolicyNetwork, PolicyCard]:
             raise InvalidFileError(weights_path, name, want, got)
     network.to_empty(device="cpu").load_state_dict(weights)
     return network, card
+
+
+class _Undrawn(TorchFunctionMode):
+    """Leaves out the drawing of initial weights: on the meta device it would import torch._dynamo, 0.9 s of CPU."""
+
+    def __torch_function__(
+        self, func: Callable[..., Any], types: Any, args: Sequence[Any] = (), kwargs: Mapping[str, Any] | None = None
+    ) -> Any:
+        """What torch calls instead of each of its functions."""
+        if func in (Tensor.uniform_, Tensor.normal_) or getattr(func, "__module__", "") == nn.init.__name__:
+            return (*args, *(kwargs or {}).values())[0]
+        return func(*args, **(kwargs or {}))
 
 
 def _read_weights(path: Path, card: PolicyCard) -> dict[str, Tensor]:

@@ -334,6 +334,7 @@ def require_consistent(state: State, rules: Rules, batch: int) -> None:
             raise ValueError("a row of this state runs on after its horizon")
 
 
+@njit(cache=True)
 def pass_hours(state: State, rules: Rules, b: int) -> None:
     """Let hours pass in row b, one at least, until a crew of it is free to act or the episode ends."""
     row, following = state.rows[b], -1

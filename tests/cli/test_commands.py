@@ -58,11 +58,11 @@ def test_list_names_environments_schedulers_and_views(run):
     assert "local(reach=1, comm=1, staleness=0)" in out
 
 
-def test_list_and_help_load_neither_torch_nor_zenoh_nor_matplotlib():
+def test_list_and_help_load_neither_torch_nor_zenoh_nor_matplotlib_nor_scipy():
     script = (
         "import sys; from marl_sched.cli.app import run\n"
         "run(['list']); run(['deploy', '--help']); run(['train', '-h'])\n"
-        "print(sorted({'torch', 'zenoh', 'matplotlib', 'hydra', 'ortools'} & set(sys.modules)), file=sys.stderr)"
+        "print(sorted({'torch', 'zenoh', 'matplotlib', 'hydra', 'ortools', 'scipy'} & set(sys.modules)), file=sys.stderr)"
     )
     ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert ended.stderr == "[]\n"

@@ -135,10 +135,10 @@ def evaluate_scheduler(
         scheduler.start(simulator, np.ones(simulator.batch, np.bool_))
         player = scheduler.epoch_player(simulator)
         while player is not None and (simulator.acting >= 0).any():
-            seen, decisions = player(EPOCHS_AT_ONCE)
-            shares, turns = shares + seen, turns + decisions
             if progress is not None:
                 progress((rows.start + len(rows) * _played(simulator)) / total)
+            seen, decisions = player(EPOCHS_AT_ONCE)
+            shares, turns = shares + seen, turns + decisions
         for turn in count():
             acting = simulator.acting >= 0
             if not acting.any():

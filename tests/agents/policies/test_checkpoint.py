@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -268,3 +269,13 @@ def test_a_package_inside_somebody_elses_checkout_has_no_revision(tmp_path, monk
     assert source_revision() == ""
     subprocess.run(["git", "-C", str(tmp_path), "add", "--", str(installed)], check=True)
     assert len(source_revision().removesuffix("-dirty")) == 40
+
+
+def test_loading_draws_nothing_and_does_without_the_compiler_of_torch(saved):
+    script = (
+        "import sys, torch; from marl_sched.agents.policies.checkpoint import load_network\n"
+        f"before = torch.get_rng_state(); load_network({str(saved)!r})\n"
+        "print(torch.equal(before, torch.get_rng_state()), 'torch._dynamo' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["True", "False"]
