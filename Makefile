@@ -17,7 +17,6 @@ demo: $(INSTALLED) ## seven crews as processes for thirty days, compared with ce
 test: unit wheel ## all tests, then the wheel in a second environment
 
 unit: $(INSTALLED)
-	rm -rf build/numba # an edited kernel in another file would not be noticed by Numba's cache
 	NUMBA_CACHE_DIR=$(CURDIR)/build/numba OMP_NUM_THREADS=1 $(BIN)/pytest $(PYTEST_ARGS)
 
 # The second environment borrows the dependencies of the first through a .pth file; the editable install does not

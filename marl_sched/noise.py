@@ -22,9 +22,9 @@ from enum import IntEnum
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from marl_sched.errors import require_integer
+from marl_sched.kernels import kernel
 
 FIRST_DOMAIN_STREAM = 16
 
@@ -48,7 +48,7 @@ def as_seed(seed: Any) -> int:
     return require_integer("seed", seed, 0, 2**63 - 1)
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def mix(x: np.uint64) -> np.uint64:
     """The finaliser of SplitMix64, a bijection of 64-bit words in which every input bit moves every output bit."""
     x = (x ^ (x >> _S30)) * _MIX_1
@@ -56,7 +56,7 @@ def mix(x: np.uint64) -> np.uint64:
     return x ^ (x >> _S31)
 
 
-@njit(cache=True)
+@kernel
 def episode_key(seed: int | np.uint64, instance: int | np.uint64, episode: int | np.uint64) -> np.uint64:
     """The key of one episode of one instance; each argument is read as a 64-bit word."""
     key = mix(np.uint64(seed) + _GAMMA)
@@ -64,32 +64,32 @@ def episode_key(seed: int | np.uint64, instance: int | np.uint64, episode: int |
     return mix((key ^ np.uint64(episode)) + _GAMMA)
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def time_key(episode: np.uint64, time: int) -> np.uint64:
     """The key of one decision epoch of simulated time within an episode."""
     return mix((np.uint64(episode) ^ np.uint64(time)) + _GAMMA)
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def word(time_word: np.uint64, stream: int, entity: int, draw: int) -> np.uint64:
     """Sixty-four random bits for one draw; `stream` < 256, `draw` < 65536, `entity` < 2**40."""
     name = (np.uint64(stream) << _S56) | (np.uint64(draw) << _S40) | np.uint64(entity)
     return mix(np.uint64(time_word) + (name + np.uint64(1)) * _GAMMA)
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def uniform(time_word: np.uint64, stream: int, entity: int, draw: int) -> float:
     """A uniform in [0, 1) with 53 random bits."""
     return np.float64(word(time_word, stream, entity, draw) >> _S11) * _TO_UNIT
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def integer(u: float, low: int, high: int) -> int:
     """The uniform `u` in [0, 1) as an integer of [low, high], both ends included."""
     return low + int(u * (high - low + 1))
 
 
-@njit(cache=True)
+@kernel
 def uniforms(keys: np.ndarray, times: np.ndarray, stream: int, entities: np.ndarray, draw: int) -> np.ndarray:
     """One uniform per row, float64 (B,), from episode keys (B,), times (B,) and entities (B,)."""
     out = np.empty(keys.shape[0])

@@ -12,13 +12,14 @@ All functions are compiled. The plain ones work on one network (n, n), those nam
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from marl_sched.kernels import kernel
 
 UNBOUNDED = 1 << 40
 """The distance between points that no path of bounds connects; real bounds must stay far below it."""
 
 
-@njit(cache=True)
+@kernel
 def unconstrained(n: int) -> np.ndarray:
     """A network of n points without any bound, int64 (n, n)."""
     distances = np.full((n, n), UNBOUNDED, np.int64)
@@ -27,14 +28,14 @@ def unconstrained(n: int) -> np.ndarray:
     return distances
 
 
-@njit(cache=True)
+@kernel
 def relax(distances: np.ndarray, source: int, target: int, bound: int) -> None:
     """Note `time(target) - time(source) <= bound` without closing the network: for building before `close`."""
     if bound < distances[source, target]:
         distances[source, target] = bound
 
 
-@njit(cache=True)
+@kernel
 def close(distances: np.ndarray) -> bool:
     """Floyd-Warshall in place, O(n^3); False if the network is inconsistent."""
     n = distances.shape[0]
@@ -50,7 +51,7 @@ def close(distances: np.ndarray) -> bool:
     return np.diag(distances).min() >= 0
 
 
-@njit(cache=True)
+@kernel
 def tighten(distances: np.ndarray, source: int, target: int, bound: int) -> bool:
     """Add `time(target) - time(source) <= bound` to a closed network and close it again, O(n^2).
 
@@ -73,19 +74,19 @@ def tighten(distances: np.ndarray, source: int, target: int, bound: int) -> bool
     return True
 
 
-@njit(cache=True)
+@kernel
 def earliest_times(distances: np.ndarray, origin: int) -> np.ndarray:
     """The earliest time of every point with the origin at 0, int64 (n,), -UNBOUNDED where nothing holds it back."""
     return -distances[:, origin].copy()
 
 
-@njit(cache=True)
+@kernel
 def latest_times(distances: np.ndarray, origin: int) -> np.ndarray:
     """The latest time of every point with the origin at 0, int64 (n,), UNBOUNDED where nothing presses it."""
     return distances[origin, :].copy()
 
 
-@njit(cache=True)
+@kernel
 def close_batch(distances: np.ndarray) -> np.ndarray:
     """`close` for each of (B, n, n) in place; bool (B,), which are consistent."""
     consistent = np.empty(distances.shape[0], np.bool_)
@@ -94,7 +95,7 @@ def close_batch(distances: np.ndarray) -> np.ndarray:
     return consistent
 
 
-@njit(cache=True)
+@kernel
 def tighten_batch(distances: np.ndarray, sources: np.ndarray, targets: np.ndarray, bounds: np.ndarray) -> np.ndarray:
     """`tighten` for each of (B, n, n) by its own bound, int64 (B,) each; bool (B,), which are still consistent."""
     consistent = np.empty(distances.shape[0], np.bool_)

@@ -18,9 +18,9 @@ where it need not; near bool (N, N), pairs that must not overlap; deadlines int6
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from marl_sched.envs.murse.instance import NO_DEADLINE
+from marl_sched.kernels import kernel
 from marl_sched.noise import time_key, uniform
 
 HORIZON_LOADS = 1.3
@@ -35,7 +35,7 @@ _UNREACHED = 1 << 60
 _STREAM = 0  # of the search's draws
 
 
-@njit(cache=True)
+@kernel
 def shortest_durations(durations: np.ndarray) -> np.ndarray:
     """The least duration of each task over its eligible agents, int64 (N,)."""
     shortest = np.full(len(durations), _UNREACHED, np.int64)
@@ -46,7 +46,7 @@ def shortest_durations(durations: np.ndarray) -> np.ndarray:
     return shortest
 
 
-@njit(cache=True)
+@kernel
 def common_horizon(durations: np.ndarray) -> float:
     """HORIZON_LOADS x the mean load: every task at its mean duration, shared evenly among the agents."""
     total = 0.0
@@ -60,7 +60,7 @@ def common_horizon(durations: np.ndarray) -> float:
     return HORIZON_LOADS * total / durations.shape[1]
 
 
-@njit(cache=True)
+@kernel
 def latest_starts(durations: np.ndarray, lags: np.ndarray, deadlines: np.ndarray, horizon: float) -> np.ndarray:
     """Latest start of each task, float64 (N,); negative where a deadline cannot be held.
 
@@ -92,7 +92,7 @@ def latest_starts(durations: np.ndarray, lags: np.ndarray, deadlines: np.ndarray
     return finish - shortest
 
 
-@njit(cache=True)
+@kernel
 def successors(lags: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Who waits for each task, as lists: (first int64 (N + 1,), tasks int64 (W,), lags int64 (W,)).
 
@@ -115,7 +115,7 @@ def successors(lags: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return first, tasks, times
 
 
-@njit(cache=True)
+@kernel
 def _earliest_on(durations: np.ndarray, task: int, release: int, ready: np.ndarray) -> tuple[int, int, int]:
     """The agent that finishes a task earliest, ties to the lower index, with its start and finish."""
     best, start, finish = -1, _UNREACHED, _UNREACHED
@@ -128,7 +128,7 @@ def _earliest_on(durations: np.ndarray, task: int, release: int, ready: np.ndarr
     return best, start, finish
 
 
-@njit(cache=True)
+@kernel
 def complete(
     durations: np.ndarray,
     waiting: tuple[np.ndarray, np.ndarray, np.ndarray],
@@ -187,7 +187,7 @@ def complete(
     return count
 
 
-@njit(cache=True)
+@kernel
 def _release(
     task: int,
     end: int,
@@ -211,7 +211,7 @@ def _release(
             fresh[other] = True
 
 
-@njit(cache=True)
+@kernel
 def generate(
     durations: np.ndarray, lags: np.ndarray, near: np.ndarray, keys: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -226,7 +226,7 @@ def generate(
     return order[:count], doers[order[:count]], start, finish
 
 
-@njit(cache=True)
+@kernel
 def least_latest_start(
     durations: np.ndarray, lags: np.ndarray, near: np.ndarray, deadlines: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -236,7 +236,7 @@ def least_latest_start(
     return order, agents, start, finish, keys
 
 
-@njit(cache=True)
+@kernel
 def cost(finish: np.ndarray, deadlines: np.ndarray, weights: np.ndarray, objective: int) -> tuple[int, float]:
     """What the search minimises, in this order: the sum of lateness, then MAKESPAN or WEIGHTED completion time.
 
@@ -251,7 +251,7 @@ def cost(finish: np.ndarray, deadlines: np.ndarray, weights: np.ndarray, objecti
     return late, weighted if objective == WEIGHTED else float(makespan)
 
 
-@njit(cache=True)
+@kernel
 def climb(
     durations: np.ndarray,
     waiting: tuple[np.ndarray, np.ndarray, np.ndarray],

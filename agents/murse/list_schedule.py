@@ -7,7 +7,6 @@ their first schedule and completes those that are part of the way.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from marl_sched.agents.murse.problem import Plan, Round
 from marl_sched.envs.murse.instance import NO_DEADLINE
@@ -15,12 +14,13 @@ from marl_sched.envs.murse.rules import FIRST, LEAST_LEFT, MEAN_ALL, PICKING
 from marl_sched.envs.murse.state import NEVER, NOBODY, NOT_WAITING
 from marl_sched.envs.murse.timetable import deadlines_hold, earliest_start, waits_heeded
 from marl_sched.errors import require
+from marl_sched.kernels import kernel
 
 NO_DEADLINE_PRIORITY = 1e9
 """Tasks without a deadline come after all that have one."""
 
 
-@njit(cache=True)
+@kernel
 def preference(durations: np.ndarray, done: np.ndarray, picking: int, agent: int) -> float:
     """What the picking strategy minimises (section 4.2.2), on int64 (N, A) durations and bool (N,) `done`."""
     if picking == FIRST:
@@ -35,7 +35,7 @@ def preference(durations: np.ndarray, done: np.ndarray, picking: int, agent: int
     return least if picking == LEAST_LEFT or count == 0 else total / count
 
 
-@njit(cache=True)
+@kernel
 def next_event_time(clock: int, order: np.ndarray, count: int, lags: np.ndarray, finish: np.ndarray) -> int:
     """When the next dispatched task ends or wait elapses after `clock`; NEVER if none does."""
     wakes = NEVER
@@ -50,7 +50,7 @@ def next_event_time(clock: int, order: np.ndarray, count: int, lags: np.ndarray,
     return wakes
 
 
-@njit(cache=True)
+@kernel
 def best_startable(
     priority: np.ndarray,
     agent: int,
@@ -77,7 +77,7 @@ def best_startable(
     return best
 
 
-@njit(cache=True)
+@kernel
 def dispatch_all(
     durations: np.ndarray,
     lags: np.ndarray,

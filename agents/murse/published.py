@@ -10,7 +10,6 @@ horizon (the largest sum of one agent's durations) cannot be held, the agent is 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from marl_sched.agents.murse.following import PlanningScheduler
 from marl_sched.agents.murse.genetic import GeneticEdf, evolve, swap_order
@@ -19,13 +18,14 @@ from marl_sched.agents.murse.snapshot import estimated_round
 from marl_sched.envs.murse.instance import NO_DEADLINE
 from marl_sched.envs.murse.simulator import MurseSimulator
 from marl_sched.envs.murse.timetable import worst_case
+from marl_sched.kernels import kernel
 
 NEARBY = 0.5
 """Starts that lie at most this share of the mean duration apart are nearby for the search."""
 _UNREACHED = 1 << 60
 
 
-@njit(cache=True)
+@kernel
 def initial_finishes(
     lasts: np.ndarray, lags: np.ndarray, deadlines: np.ndarray, horizon: int
 ) -> tuple[bool, np.ndarray]:
@@ -51,7 +51,7 @@ def initial_finishes(
     return consistent, finish
 
 
-@njit(cache=True)
+@kernel
 def published_order(
     durations: np.ndarray, lags: np.ndarray, near: np.ndarray, deadlines: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -104,7 +104,7 @@ def published_order(
     return order[:count], doers[:count]
 
 
-@njit(cache=True)
+@kernel
 def _first_choice(durations: np.ndarray, done: np.ndarray, free_at: np.ndarray, clock: int, passed: np.ndarray) -> int:
     """The free agent of the least mean duration over unscheduled tasks that has not been passed over; -1: none."""
     best, least = -1, np.inf
@@ -122,7 +122,7 @@ def _first_choice(durations: np.ndarray, done: np.ndarray, free_at: np.ndarray, 
     return best
 
 
-@njit(cache=True)
+@kernel
 def _next_event(free_at: np.ndarray, release: np.ndarray, done: np.ndarray, ahead: np.ndarray, clock: int) -> int:
     """When, after `clock`, the next agent is free or the next task can start; between two events nothing changes."""
     after = _UNREACHED

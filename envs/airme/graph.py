@@ -9,12 +9,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from marl_sched.envs.airme.dynamics import UNDECIDED, Record, State
 from marl_sched.envs.airme.views import EVERYWHERE, home_sector, ring_distance
 from marl_sched.errors import InvalidOptionError
 from marl_sched.graph import GraphSpec, NodeType, Relation
+from marl_sched.kernels import kernel
 
 _PLANE = (
     "hours/10", "usage_probability", "landings/5", "broken", "income/10", "free", "in_repair", "chosen_this_hour",
@@ -66,7 +66,7 @@ class Arrays(NamedTuple):
     visible_share: np.ndarray
 
 
-@njit(cache=True)
+@kernel
 def observe(state: State, usage: np.ndarray, agents: np.ndarray, limits: np.ndarray, out: Arrays) -> None:
     """Write what each row's agent, int64 (B,), sees; a negative agent sees nothing.
 
@@ -95,7 +95,7 @@ def observe(state: State, usage: np.ndarray, agents: np.ndarray, limits: np.ndar
             out.visible_share[b] = 0
 
 
-@njit(cache=True)
+@kernel
 def require_fitting(state: State, n_types: int, agents: np.ndarray, limits: np.ndarray, out: Arrays) -> None:
     """Raise InvalidOptionError where arrays or agents do not fit: compiled code does not check its indices."""
     batch, slots, crews = len(agents), state.planes.shape[1], state.crews.shape[1]
@@ -111,7 +111,7 @@ def require_fitting(state: State, n_types: int, agents: np.ndarray, limits: np.n
             raise InvalidOptionError("agents: expected agents below max_agents")
 
 
-@njit(cache=True)
+@kernel
 def see_crews(state: State, b: int, agent: int, comm: int, out: Arrays) -> None:
     """Crews within `comm`, with their present jobs."""
     n_crews = state.rows[b].n_crews
@@ -128,7 +128,7 @@ def see_crews(state: State, b: int, agent: int, comm: int, out: Arrays) -> None:
         out.crew[b, crew, 5] = record.job_done * TENTH
 
 
-@njit(cache=True)
+@kernel
 def see_planes(state: State, usage: np.ndarray, b: int, agent: int, reach: int, staleness: int, out: Arrays) -> None:
     """Planes of the sectors within `reach`, each as this crew knows it; all others are zero."""
     row = state.rows[b]
@@ -165,7 +165,7 @@ def see_planes(state: State, usage: np.ndarray, b: int, agent: int, reach: int, 
     out.visible_share[b] = visible / row.n_planes
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def describe(plane: Record, usage: np.ndarray, age: int, out: np.ndarray, b: int, slot: int) -> None:
     """A plane's features from its record; `age` is how many hours old the snapshot is.
 
@@ -193,7 +193,7 @@ def describe(plane: Record, usage: np.ndarray, age: int, out: np.ndarray, b: int
         out[b, slot, N_PLANE + k] = plane.kind == k
 
 
-@njit(cache=True)
+@kernel
 def hear_of_jobs(state: State, b: int, out: Arrays) -> None:
     """What a visible crew says of its own work is newer than any delayed snapshot of the plane."""
     for crew in range(state.rows[b].n_crews):
@@ -213,7 +213,7 @@ def hear_of_jobs(state: State, b: int, out: Arrays) -> None:
             out.plane[b, slot, 7] = 1
 
 
-@njit(cache=True)
+@kernel
 def write_action_mask(state: State, b: int, agent: int, out: Arrays) -> None:
     """The actions that are legal as far as the crew knows: visible planes that nobody has in hand."""
     if state.crews[b, agent].plane > 0 or state.crews[b, agent].choice != UNDECIDED:
@@ -223,7 +223,7 @@ def write_action_mask(state: State, b: int, agent: int, out: Arrays) -> None:
             out.action_mask[b, slot] = 1
 
 
-@njit(cache=True)
+@kernel
 def summarise(out: Arrays, b: int, n_planes: int) -> None:
     """The state node's features, from visible nodes alone."""
     n_crews = 0

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from marl_sched.envs.airme.dynamics import Stream
 from marl_sched.errors import InvalidOptionError, require_integer
+from marl_sched.kernels import kernel
 from marl_sched.noise import integer, time_key, uniform
 
 EVERYWHERE = 1 << 30
@@ -131,13 +131,13 @@ View = FullView | LocalView | RandomView
 VIEWS: dict[str, type] = {"full": FullView, "local": LocalView, "random": RandomView}
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def home_sector(slot: int, n_crews: int) -> int:
     """The sector, a crew's index, to which the plane in a slot belongs."""
     return (slot - 1) % n_crews
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def ring_distance(a: int, b: int, n_crews: int) -> int:
     """Steps between two crews the shorter way round."""
     apart = abs(a - b)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from marl_sched.kernels import kernel
 
 
-@njit(cache=True)
+@kernel
 def random_legal(mask: np.ndarray, uniform: np.ndarray) -> np.ndarray:
     """A legal action for each row, int64 (B,), each with the same probability.
 
@@ -27,7 +28,7 @@ def random_legal(mask: np.ndarray, uniform: np.ndarray) -> np.ndarray:
     return actions
 
 
-@njit(cache=True)
+@kernel
 def first_illegal(mask: np.ndarray, actions: np.ndarray, acting: np.ndarray) -> int:
     """The first row whose acting agent chose what its mask forbids or what is no action, -1 if there is none.
 

@@ -16,7 +16,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from marl_sched.envs.murse.estimator import predict, update
 from marl_sched.envs.murse.learning import drawn_duration, mean_duration, whole
@@ -24,6 +23,7 @@ from marl_sched.envs.murse.rules import DECISION_REWARD, FIRST, LEAST_LEFT, MEAN
 from marl_sched.envs.murse.scoring import cost_so_far, evaluate_round, round_cost
 from marl_sched.envs.murse.state import NEVER, NOBODY, NOT_WAITING, NOTHING, State
 from marl_sched.envs.murse.timetable import earliest_start, longest_round, time_order, waits_heeded
+from marl_sched.kernels import kernel
 from marl_sched.noise import time_key
 
 Record = Any  # one element of a record array, whose fields compiled code reads as attributes
@@ -33,7 +33,7 @@ IDLE_AFTER_CONFLICT = 1
 MAX_HUMANS = 1 << 12
 
 
-@njit(cache=True)
+@kernel
 def begin_episode(state: State, rules: Rules, b: int) -> None:
     """Row b starts its first round, with `episode` and the instance's data in place."""
     row = state.rows[b]
@@ -53,7 +53,7 @@ def begin_episode(state: State, rules: Rules, b: int) -> None:
     begin_round(state, rules, b)
 
 
-@njit(cache=True)
+@kernel
 def begin_round(state: State, rules: Rules, b: int) -> None:
     """Draw the round's durations and estimates, forget the last round's schedule, and let the first agent decide."""
     row, tasks, agents = state.rows[b], state.tasks[b], state.agents[b]
@@ -76,7 +76,7 @@ def begin_round(state: State, rules: Rules, b: int) -> None:
     row.acting = pick_agent(state, rules, b)
 
 
-@njit(cache=True)
+@kernel
 def draw_durations(state: State, b: int) -> None:
     """True durations of this round, one draw per task and human, and what the team expects of them."""
     row = state.rows[b]
@@ -101,7 +101,7 @@ def draw_durations(state: State, b: int) -> None:
             pair.mean = pair.true
 
 
-@njit(cache=True)
+@kernel
 def pick_agent(state: State, rules: Rules, b: int) -> int:
     """Who decides next: of the agents that are free earliest the one the strategy prefers (section 4.2.2).
 
@@ -123,7 +123,7 @@ def pick_agent(state: State, rules: Rules, b: int) -> int:
     return best
 
 
-@njit(cache=True)
+@kernel
 def preference(state: State, picking: int, b: int, agent: int) -> float:
     """What a picking strategy minimises, on estimated durations; ties go to the lower index."""
     if picking == FIRST:
@@ -140,7 +140,7 @@ def preference(state: State, picking: int, b: int, agent: int) -> float:
     return total / count
 
 
-@njit(cache=True)
+@kernel
 def dispatchable(state: State, b: int, task: int, agent: int) -> bool:
     """Whether `agent` can commit to `task` now: unscheduled, eligible, and behind all that it waits for."""
     row = state.rows[b]
@@ -149,7 +149,7 @@ def dispatchable(state: State, b: int, task: int, agent: int) -> bool:
     return waits_heeded(task, row.n_tasks, state.order[b], row.dispatched, state.lags[b])
 
 
-@njit(cache=True)
+@kernel
 def dispatch(state: State, rules: Rules, b: int, task: int, agent: int) -> None:
     """Append a task to the acting agent's schedule; agents that wait for a commitment wake."""
     row, agents, job = state.rows[b], state.agents[b], state.tasks[b, task]
@@ -171,7 +171,7 @@ def dispatch(state: State, rules: Rules, b: int, task: int, agent: int) -> None:
             agents[other].free_at = min(agents[other].free_at, wakes)
 
 
-@njit(cache=True)
+@kernel
 def wait(state: State, b: int, agent: int) -> None:
     """Let the agent decide again when a task ends or a wait elapses, at least one unit on; `dispatch` may wake it."""
     row, tasks = state.rows[b], state.tasks[b]
@@ -189,7 +189,7 @@ def wait(state: State, b: int, agent: int) -> None:
     state.agents[b, agent].waiting_since = row.clock
 
 
-@njit(cache=True)
+@kernel
 def decide(state: State, rules: Rules, b: int, action: int) -> None:
     """The acting agent waits, commits to task `action - 1`, or idles a unit because that is impossible in truth."""
     row, agent = state.rows[b], state.rows[b].acting
@@ -209,7 +209,7 @@ def decide(state: State, rules: Rules, b: int, action: int) -> None:
             tell(state, rules, b, action - 1, agent)
 
 
-@njit(cache=True)
+@kernel
 def tell(state: State, rules: Rules, b: int, task: int, agent: int) -> None:
     """An agent that came to a taken task learns when it starts and ends, as far as its worker can tell now."""
     job, now, told = state.tasks[b, task], state.rows[b].clock, state.private_memory[b, agent, task]
@@ -219,7 +219,7 @@ def tell(state: State, rules: Rules, b: int, task: int, agent: int) -> None:
         told[1] = max(told[0] + state.pairs[b, task, job.agent].planned, now + 1)
 
 
-@njit(cache=True)
+@kernel
 def execute_plan(state: State, b: int) -> bool:
     """Give the dispatched tasks their true times: the earliest that keep each agent's and the dispatch order.
 
@@ -232,7 +232,7 @@ def execute_plan(state: State, b: int) -> bool:
     )
 
 
-@njit(cache=True)
+@kernel
 def learn(state: State, b: int) -> None:
     """Finished tasks count as repetitions of their humans, and the team's estimates take them in."""
     row = state.rows[b]
@@ -246,7 +246,7 @@ def learn(state: State, b: int) -> None:
             pair.repetitions += 1
 
 
-@njit(cache=True)
+@kernel
 def end_round(state: State, rules: Rules, b: int) -> None:
     """Execute, evaluate and pay the round, then begin the next one or end the episode."""
     row = state.rows[b]
@@ -269,7 +269,7 @@ def end_round(state: State, rules: Rules, b: int) -> None:
         row.terminated = True
 
 
-@njit(cache=True)
+@kernel
 def require_consistent(state: State, batch: int) -> None:
     """Raise ValueError where arrays do not belong together or a row does not fit into them: writing would go astray.
 
@@ -291,7 +291,7 @@ def require_consistent(state: State, batch: int) -> None:
             raise ValueError("a row of this state runs on after its last round")
 
 
-@njit(cache=True)
+@kernel
 def step(state: State, rules: Rules, actions: np.ndarray) -> None:
     """Take a turn, int64 (B,), in every row that is not over, and go on to its next acting agent."""
     require_consistent(state, len(actions))
@@ -311,14 +311,14 @@ def step(state: State, rules: Rules, actions: np.ndarray) -> None:
         row.elapsed = row.time - before
 
 
-@njit(cache=True)
+@kernel
 def begin_rows(state: State, rules: Rules, rows: np.ndarray) -> None:
     """`begin_episode` for each of `rows`, int64 (n,)."""
     for b in rows:
         begin_episode(state, rules, b)
 
 
-@njit(cache=True)
+@kernel
 def play_round(state: State, rules: Rules, b: int, tasks: np.ndarray, agents: np.ndarray) -> None:
     """Take int64 (K,) tasks and agents as this round's whole plan in row b, then end the round.
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 from enum import IntEnum
 
 import numpy as np
-from numba import njit
 
+from marl_sched.kernels import kernel
 from marl_sched.noise import FIRST_DOMAIN_STREAM, uniform
 
 CURVE = ("c", "c_std", "k", "k_std", "beta", "beta_std")
@@ -30,7 +30,7 @@ class MurseStream(IntEnum):
     DURATION = FIRST_DOMAIN_STREAM  # time = round, entity = (task, human), draws 0..3
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def remaining_share(beta: float, repetitions: int, learning: int) -> float:
     """The share of k that is still to be learnt away: exp(-beta i), or its limits for the two other modes."""
     if learning == NONE or repetitions == 0:
@@ -40,19 +40,19 @@ def remaining_share(beta: float, repetitions: int, learning: int) -> float:
     return np.exp(-beta * repetitions)
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def whole(duration: float, low: int, high: int) -> int:
     """A duration in whole time units, rounded down and clipped to the instance's range [low, high]."""
     return int(min(max(np.floor(duration), low), high))
 
 
-@njit(cache=True)
+@kernel
 def mean_duration(curve: np.ndarray, repetitions: int, learning: int) -> float:
     """Equation 5.1 for one curve, float64 (6,)."""
     return curve[C] + curve[K] * remaining_share(curve[BETA], repetitions, learning)
 
 
-@njit(cache=True)
+@kernel
 def normal_pair(time_word: np.uint64, entity: int, draw: int) -> tuple[float, float]:
     """Two standard normals from draws `draw` and `draw + 1` (Box and Muller, 1958)."""
     radius = np.sqrt(-2.0 * np.log(1.0 - uniform(time_word, MurseStream.DURATION, entity, draw)))
@@ -60,7 +60,7 @@ def normal_pair(time_word: np.uint64, entity: int, draw: int) -> tuple[float, fl
     return radius * np.cos(angle), radius * np.sin(angle)
 
 
-@njit(cache=True)
+@kernel
 def drawn_duration(curve: np.ndarray, repetitions: int, learning: int, time_word: np.uint64, entity: int) -> float:
     """One execution's duration of a stochastic human, before rounding and clipping.
 

@@ -8,27 +8,27 @@ Distances are those of marl_sched.temporal_network.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from marl_sched.envs.murse.instance import NO_DEADLINE
+from marl_sched.kernels import kernel
 from marl_sched.temporal_network import relax, unconstrained
 
 ORIGIN, END = 0, 1
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def start_point(task: int) -> int:
     """The point of the full network at which a task, counted from 0, starts."""
     return 2 + 2 * task
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def finish_point(task: int) -> int:
     """The point of the full network at which a task, counted from 0, finishes."""
     return 3 + 2 * task
 
 
-@njit(cache=True)
+@kernel
 def task_network(
     shortest: np.ndarray, longest: np.ndarray, lags: np.ndarray, deadlines: np.ndarray, horizon: int
 ) -> np.ndarray:
@@ -55,7 +55,7 @@ def task_network(
     return distances
 
 
-@njit(cache=True)
+@kernel
 def simplified_bounds(durations: np.ndarray, lags: np.ndarray, deadlines: np.ndarray, horizon: int) -> np.ndarray:
     """The bounds (source, target, bound) on starts alone, int64 (m, 3), points s0, s_1, ..., s_n, f0.
 
@@ -79,7 +79,7 @@ def simplified_bounds(durations: np.ndarray, lags: np.ndarray, deadlines: np.nda
     return bounds[:m]
 
 
-@njit(cache=True)
+@kernel
 def network_of(bounds: np.ndarray, n_points: int) -> np.ndarray:
     """The network of int64 (m, 3) bounds, not yet closed, int64 (n_points, n_points).
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from marl_sched.envs.murse.dynamics import Record
 from marl_sched.envs.murse.graph import (
@@ -43,10 +42,11 @@ from marl_sched.envs.murse.state import NEVER, NOBODY, State
 from marl_sched.envs.murse.timetable import earliest_start
 from marl_sched.envs.murse.views import Sight, new_sight, standpoint, survey
 from marl_sched.errors import InvalidOptionError
+from marl_sched.kernels import kernel
 from marl_sched.temporal_network import UNBOUNDED, close
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def observe(state: State, rules: Rules, agents: np.ndarray, sensing: float, comm: float, out: Arrays) -> None:
     """Write what each row's agent, int64 (B,), sees; a negative agent sees nothing."""
     require_fitting(state, agents, out)
@@ -69,7 +69,7 @@ def observe(state: State, rules: Rules, agents: np.ndarray, sensing: float, comm
             write_action_mask(state, b, sight, out)
 
 
-@njit(cache=True)
+@kernel
 def require_fitting(state: State, agents: np.ndarray, out: Arrays) -> None:
     """Raise InvalidOptionError where arrays or agents do not fit: compiled code does not check its indices."""
     batch, n, m = len(agents), state.tasks.shape[1], state.agents.shape[1]
@@ -90,7 +90,7 @@ def require_fitting(state: State, agents: np.ndarray, out: Arrays) -> None:
             raise InvalidOptionError("agents: expected agents below max_agents")
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def clear(out: Arrays, b: int) -> None:
     """Forget what a row held."""
     out.task[b] = 0.0
@@ -117,7 +117,7 @@ def clear(out: Arrays, b: int) -> None:
     out.visible_share[b] = 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def see_agents(state: State, b: int, viewer: int, sight: Sight, out: Arrays) -> None:
     """Agents within hearing, when they will be free and how many tasks they have."""
     row = state.rows[b]
@@ -140,7 +140,7 @@ def see_agents(state: State, b: int, viewer: int, sight: Sight, out: Arrays) -> 
             out.agent[b, state.tasks[b, task].agent, 5] += 1 / row.n_tasks
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def see_tasks(state: State, b: int, viewer: int, sight: Sight, out: Arrays) -> None:
     """The placeholders and the tasks in sight, each as the viewer knows it."""
     row, tasks, lags, near = state.rows[b], state.tasks[b], state.lags[b], state.near[b]
@@ -179,7 +179,7 @@ def see_tasks(state: State, b: int, viewer: int, sight: Sight, out: Arrays) -> N
     out.visible_share[b] = visible / n
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def describe_task(features: np.ndarray, job: Record, unit: int, now: int, x: float, y: float) -> None:
     """What a task is: its weight, its deadline from now, and how far it lies from (x, y)."""
     features[DISTANCE_TO] = np.hypot(job.x - x, job.y - y) / 10
@@ -189,7 +189,7 @@ def describe_task(features: np.ndarray, job: Record, unit: int, now: int, x: flo
         features[DEADLINE] = (job.deadline - now) / unit
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def describe_durations(features: np.ndarray, pairs: np.ndarray, viewer: int, heard: np.ndarray, unit: int) -> None:
     """Estimates for the viewer, and their statistics over the eligible agents within hearing (section 4.3.1)."""
     own = pairs[viewer]
@@ -212,7 +212,7 @@ def describe_durations(features: np.ndarray, pairs: np.ndarray, viewer: int, hea
         features[STD_DURATION] = np.sqrt(max(squares / count - (total / count) ** 2, 0.0))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def describe_waits(features: np.ndarray, task: int, lags: np.ndarray, taken: np.ndarray, seen: np.ndarray) -> None:
     """Count in float32 (slots, F) for how many tasks that are not in `taken`, int64 (k,), a task in sight waits.
 
@@ -229,7 +229,7 @@ def describe_waits(features: np.ndarray, task: int, lags: np.ndarray, taken: np.
     features[task + 1, WAITS_UNHEEDED] = unheeded
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def describe_commitment(features: np.ndarray, start: int, finish: int, unit: int) -> None:
     """A taken task's believed times from now."""
     features[FINISHED] = finish <= 0
@@ -238,7 +238,7 @@ def describe_commitment(features: np.ndarray, start: int, finish: int, unit: int
     features[FINISH] = finish / unit
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def see_durations(state: State, b: int, sight: Sight, out: Arrays) -> None:
     """Edges between unscheduled tasks and eligible agents, with estimate and spread, both ways."""
     row = state.rows[b]
@@ -257,7 +257,7 @@ def see_durations(state: State, b: int, sight: Sight, out: Arrays) -> None:
                 out.use_time_attributes[b, task + 1, agent, 1] = spread
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def see_locations(state: State, b: int, sight: Sight, out: Arrays) -> None:
     """Locations of tasks in sight, and which of them lie too close for work at the same time."""
     row = state.rows[b]
@@ -275,7 +275,7 @@ def see_locations(state: State, b: int, sight: Sight, out: Arrays) -> None:
                 out.near[b, place, state.tasks[b, other].place] = 1
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def see_network(state: State, b: int, sight: Sight, out: Arrays) -> None:
     """Edges of the temporal network over the tasks in sight, those taken in their agents' order."""
     row = state.rows[b]
@@ -304,7 +304,7 @@ def see_network(state: State, b: int, sight: Sight, out: Arrays) -> None:
                 out.temporal_attributes[b, slots[v], slots[u], 0] = distances[u, v] / unit
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def visible_bounds(
     seen: np.ndarray, tasks: np.ndarray, pairs: np.ndarray, lags: np.ndarray, sight: Sight
 ) -> np.ndarray:
@@ -340,7 +340,7 @@ def visible_bounds(
     return simplified_bounds(durations, inner, deadlines, horizon)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def write_action_mask(state: State, b: int, sight: Sight, out: Arrays) -> None:
     """The actions that are legal as far as the viewer knows: free, eligible, and behind all that they wait for."""
     for slot in range(1, state.rows[b].n_tasks + 1):
@@ -350,7 +350,7 @@ def write_action_mask(state: State, b: int, sight: Sight, out: Arrays) -> None:
             out.action_mask[b, slot] = 1
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def summarise(state: State, b: int, sight: Sight, out: Arrays) -> None:
     """The state node's features and the edges from the viewer to its decisions, from visible nodes alone."""
     row, features = state.rows[b], out.state[b]

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from marl_sched.envs.murse.instance import NO_DEADLINE
 from marl_sched.envs.murse.rules import MAKESPAN, PUBLISHED_REWARD, Rules
 from marl_sched.envs.murse.state import State
 from marl_sched.envs.murse.timetable import longest_round, worst_case
+from marl_sched.kernels import kernel
 
 
-@njit(cache=True)
+@kernel
 def cost_so_far(state: State, rules: Rules, b: int) -> float:
     """Makespan or weighted completion time of the tasks dispatched so far, as their times stand."""
     row, tasks = state.rows[b], state.tasks[b]
@@ -22,13 +22,13 @@ def cost_so_far(state: State, rules: Rules, b: int) -> float:
     return cost
 
 
-@njit(cache=True)
+@kernel
 def total_weight(state: State, rules: Rules, b: int) -> float:
     """What a time that stands for all tasks is multiplied by: 1, or the sum of weights."""
     return 1.0 if rules.objective == MAKESPAN else state.tasks[b].weight[: state.rows[b].n_tasks].sum()
 
 
-@njit(cache=True)
+@kernel
 def evaluate_round(state: State, b: int, consistent: bool) -> None:
     """Note in `rounds` and `executed` how the round went, on true times; an inconsistent one is infeasible."""
     row, tasks = state.rows[b], state.tasks[b]
@@ -52,7 +52,7 @@ def evaluate_round(state: State, b: int, consistent: bool) -> None:
     result.feasible = consistent and not result.stuck and not late and result.makespan <= result.longest
 
 
-@njit(cache=True)
+@kernel
 def published_loss(state: State, rules: Rules, b: int) -> float:
     """Equation 5.2 as published, in which failing can pay better than finishing.
 
@@ -80,7 +80,7 @@ def published_loss(state: State, rules: Rules, b: int) -> float:
     return cost + rules.multiplier * left
 
 
-@njit(cache=True)
+@kernel
 def round_cost(state: State, rules: Rules, b: int) -> float:
     """What a judged round costs in training.
 

@@ -9,12 +9,12 @@ the dispatched tasks finds it; the network is inconsistent when tasks must prece
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from marl_sched.envs.murse.instance import NO_DEADLINE
+from marl_sched.kernels import kernel
 
 
-@njit(cache=True)
+@kernel
 def earliest_start(
     task: int, ready: int, order: np.ndarray, count: int, lags: np.ndarray, near: np.ndarray, finish: np.ndarray
 ) -> int:
@@ -32,7 +32,7 @@ def earliest_start(
     return start
 
 
-@njit(cache=True)
+@kernel
 def waits_heeded(task: int, n_tasks: int, order: np.ndarray, count: int, lags: np.ndarray) -> bool:
     """Whether all tasks for which `task` waits stand among the first `count` of `order`."""
     ahead = 0
@@ -43,7 +43,7 @@ def waits_heeded(task: int, n_tasks: int, order: np.ndarray, count: int, lags: n
     return ahead == 0
 
 
-@njit(cache=True)
+@kernel
 def time_order(
     order: np.ndarray,
     agents: np.ndarray,
@@ -83,7 +83,7 @@ def time_order(
     return False
 
 
-@njit(cache=True)
+@kernel
 def deadlines_hold(order: np.ndarray, finish: np.ndarray, deadlines: np.ndarray) -> bool:
     """Whether every task of `order`, int64 (K,), ends by its deadline, int64 (N,)."""
     for k in range(len(order)):
@@ -93,7 +93,7 @@ def deadlines_hold(order: np.ndarray, finish: np.ndarray, deadlines: np.ndarray)
     return True
 
 
-@njit(cache=True)
+@kernel
 def time_batch(
     orders: np.ndarray,
     agents: np.ndarray,
@@ -119,7 +119,7 @@ def time_batch(
     return starts, finishes, makespans, feasible
 
 
-@njit(cache=True)
+@kernel
 def worst_case(durations: np.ndarray) -> int:
     """The largest sum of one agent's durations over all tasks, int64 (N, A) with 0 for ineligible pairs.
 
@@ -135,7 +135,7 @@ def worst_case(durations: np.ndarray) -> int:
     return worst
 
 
-@njit(cache=True)
+@kernel
 def longest_round(durations: np.ndarray, lags: np.ndarray) -> int:
     """The sum of every task's longest duration and of all waits: no schedule without idleness takes longer."""
     total = 0

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from marl_sched.envs.murse.rules import ONLINE, Rules
 from marl_sched.envs.murse.state import NOBODY, NOTHING, State
 from marl_sched.errors import InvalidOptionError
+from marl_sched.kernels import kernel
 
 EVERYWHERE = float("inf")
 
@@ -72,7 +72,7 @@ class Sight(NamedTuple):
     finish: np.ndarray
 
 
-@njit(cache=True)
+@kernel
 def standpoint(state: State, b: int, agent: int) -> tuple[float, float]:
     """Where an agent stands."""
     task = state.agents[b, agent].last_task
@@ -81,7 +81,7 @@ def standpoint(state: State, b: int, agent: int) -> tuple[float, float]:
     return state.tasks[b, task].x, state.tasks[b, task].y
 
 
-@njit(cache=True)
+@kernel
 def hears(state: State, b: int, viewer: int, comm: float, heard: np.ndarray) -> None:
     """Which agents are within `comm` of the viewer, itself included: writes bool (A,)."""
     x, y = standpoint(state, b, viewer)
@@ -91,7 +91,7 @@ def hears(state: State, b: int, viewer: int, comm: float, heard: np.ndarray) -> 
         heard[agent] = agent == viewer or np.hypot(there_x - x, there_y - y) <= comm
 
 
-@njit(cache=True)
+@kernel
 def senses(state: State, b: int, viewer: int, sensing: float, seen: np.ndarray) -> int:
     """Which tasks the viewer sees: writes bool (N,), returns how many."""
     n = state.rows[b].n_tasks
@@ -114,7 +114,7 @@ def senses(state: State, b: int, viewer: int, sensing: float, seen: np.ndarray) 
     return count
 
 
-@njit(cache=True)
+@kernel
 def knows(state: State, b: int, viewer: int, heard: np.ndarray, known: np.ndarray) -> None:
     """Of which tasks the viewer knows that they are taken: writes bool (N,)."""
     for task in range(state.rows[b].n_tasks):
@@ -122,7 +122,7 @@ def knows(state: State, b: int, viewer: int, heard: np.ndarray, known: np.ndarra
         known[task] = agent != NOBODY and (heard[agent] or state.private_memory[b, viewer, task, 1] >= 0)
 
 
-@njit(cache=True)
+@kernel
 def believes(
     state: State,
     rules: Rules,
@@ -165,7 +165,7 @@ def believes(
         finish[task] = max(start[task] + state.pairs[b, task, job.agent].planned, row.clock + 1)
 
 
-@njit(cache=True)
+@kernel
 def new_sight(state: State) -> Sight:
     """Room for what an agent knows, to be filled by `survey`."""
     n, m = state.tasks.shape[1], state.agents.shape[1]
@@ -173,7 +173,7 @@ def new_sight(state: State) -> Sight:
     return Sight(np.zeros(m, np.bool_), np.zeros(n, np.bool_), np.zeros(n, np.bool_), times[0], times[1])
 
 
-@njit(cache=True)
+@kernel
 def survey(state: State, rules: Rules, b: int, viewer: int, sensing: float, comm: float, sight: Sight) -> None:
     """Fill in everything that the viewer knows under (sensing, comm)."""
     hears(state, b, viewer, comm, sight.heard)

@@ -19,7 +19,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from marl_sched.envs.airme.aircraft import AircraftType, FailureModel, failure_table
 from marl_sched.envs.airme.dynamics import (
@@ -32,6 +31,7 @@ from marl_sched.envs.airme.dynamics import (
     MISSION_HOURS,
     REPAIR_HOURS,
 )
+from marl_sched.kernels import kernel
 
 BROKEN = MISSION_HOURS[1]  # index of broken planes; below it hours of mission to go
 HOURS_CAP, LANDINGS_CAP = 300, 50
@@ -83,7 +83,7 @@ def plane_model(kind: AircraftType, model: FailureModel, hours: np.ndarray, land
     return PlaneModel(float(kind.usage), 1.0 - survival, first, np.minimum(last, HOURS_CAP))
 
 
-@njit(cache=True)
+@kernel
 def mission_mean(value: np.ndarray, landings: int, hours: int) -> float:
     """The mean over mission lengths of the value after a mission's first hour."""
     total = 0.0
@@ -92,13 +92,13 @@ def mission_mean(value: np.ndarray, landings: int, hours: int) -> float:
     return total / (MISSION_HOURS[1] - MISSION_HOURS[0] + 1)
 
 
-@njit(cache=True)
+@kernel
 def wear(landings: int, hours: int) -> int:
     """Repair hours that a plane's counters add."""
     return hours // HOURS_PER_REPAIR_HOUR + landings // LANDINGS_PER_REPAIR_HOUR
 
 
-@njit(cache=True)
+@kernel
 def repair_values(time: int, horizon: int, reward: Reward, paid: np.ndarray, new: np.ndarray, out: np.ndarray) -> None:
     """Expected value of sending a crew now, float64 (2, wear) for healthy and broken planes.
 
@@ -117,7 +117,7 @@ def repair_values(time: int, horizon: int, reward: Reward, paid: np.ndarray, new
             out[broken, extra] = total / draws
 
 
-@njit(cache=True)
+@kernel
 def immortal_values(model: PlaneModel, reward: Reward, horizon: int) -> np.ndarray:
     """Values float64 (T + 1, 10) of a plane that never fails, by mission hours to go: what the caps stand for."""
     high = MISSION_HOURS[1]
@@ -133,7 +133,7 @@ def immortal_values(model: PlaneModel, reward: Reward, horizon: int) -> np.ndarr
     return out
 
 
-@njit(cache=True)
+@kernel
 def one_hour(model: PlaneModel, reward: Reward, repair: np.ndarray, later: np.ndarray, now: np.ndarray) -> None:
     """One step of backward induction: `now` from `later`, float64 (11, L + 2, H + 2) each.
 
@@ -162,7 +162,7 @@ def one_hour(model: PlaneModel, reward: Reward, repair: np.ndarray, later: np.nd
                 out[hours] = wait if wait > served[hours] else served[hours]
 
 
-@njit(cache=True)
+@kernel
 def fill_caps(value: np.ndarray, immortal: np.ndarray) -> None:
     """Write what a plane beyond the caps is worth, float64 (10,), into the last row and column."""
     for state in range(BROKEN + 1):
@@ -171,7 +171,7 @@ def fill_caps(value: np.ndarray, immortal: np.ndarray) -> None:
         value[state, value.shape[1] - 1, :] = worth
 
 
-@njit(cache=True)
+@kernel
 def solve(model: PlaneModel, reward: Reward, prices: np.ndarray, policy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Backward induction over the horizon, prices float64 (T,) per crew-hour.
 
@@ -198,7 +198,7 @@ def solve(model: PlaneModel, reward: Reward, prices: np.ndarray, policy: np.ndar
     return later, new
 
 
-@njit(cache=True)
+@kernel
 def note_policy(model: PlaneModel, repair: np.ndarray, now: np.ndarray, policy: np.ndarray) -> None:
     """Where an hour's value, float64 (11, L + 2, H + 2), is that of a repair."""
     for state in range(BROKEN + 1):
@@ -208,7 +208,7 @@ def note_policy(model: PlaneModel, repair: np.ndarray, now: np.ndarray, policy: 
                 policy[state, landings, hours] = now[state, landings, hours] == best
 
 
-@njit(cache=True)
+@kernel
 def expected_crew_hours(model: PlaneModel, policy: np.ndarray, mass: np.ndarray) -> np.ndarray:
     """Crew-hours, float64 (T,), that planes use under a policy, uint8 (T, 11, L + 1, H + 1).
 
@@ -240,7 +240,7 @@ def expected_crew_hours(model: PlaneModel, policy: np.ndarray, mass: np.ndarray)
     return np.cumsum(change)[:horizon]
 
 
-@njit(cache=True)
+@kernel
 def spend_hour(model: PlaneModel, state: int, landings: int, hours: int, planes: float, following: np.ndarray) -> None:
     """Spread planes that are not repaired over where they are an hour later."""
     if state == BROKEN:
@@ -263,7 +263,7 @@ def spend_hour(model: PlaneModel, state: int, landings: int, hours: int, planes:
             following[length - 1, landings, hours + 1] += flying / lengths
 
 
-@njit(cache=True)
+@kernel
 def send_crews(time: int, jobs: np.ndarray, change: np.ndarray, new: np.ndarray) -> None:
     """Book the repairs of an hour, float64 (2, wear): crews in use as differences, planes that come back new."""
     horizon = new.shape[0] - 1
@@ -280,7 +280,7 @@ def send_crews(time: int, jobs: np.ndarray, change: np.ndarray, new: np.ndarray)
                 new[end] += planes
 
 
-@njit(cache=True)
+@kernel
 def index_slices(model: PlaneModel, reward: Reward, prices: np.ndarray, hours: np.ndarray, out: np.ndarray) -> None:
     """Advantage of repairing now over waiting an hour, per expected repair hour, at some hours int64 (S,).
 
@@ -309,7 +309,7 @@ def index_slices(model: PlaneModel, reward: Reward, prices: np.ndarray, hours: n
         later, now = now, later
 
 
-@njit(cache=True)
+@kernel
 def note_advantage(model: PlaneModel, repair: np.ndarray, wait: np.ndarray, out: np.ndarray) -> None:
     """What a repair is worth beyond waiting, float64 (11, L + 2, H + 2), per expected hour of it."""
     mean_draw = (REPAIR_HOURS[0] + REPAIR_HOURS[1]) / 2

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from marl_sched.envs.murse.instance import NO_DEADLINE
+from marl_sched.kernels import kernel
 from marl_sched.temporal_network import close, earliest_times, relax, unconstrained
 
 UNKNOWN = -1
 
 
-@njit(cache=True)
+@kernel
 def schedule_network(
     path: np.ndarray,
     agent: int,
@@ -59,7 +59,7 @@ def schedule_network(
     return close(network), earliest_times(network, 0)[1:]
 
 
-@njit(cache=True)
+@kernel
 def best_place(
     path: np.ndarray,
     task: int,

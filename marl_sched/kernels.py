@@ -1,0 +1,169 @@
+"""Compiled kernels: Numba's `njit` with a cache that notices an edit in any kernel's source.
+
+Numba keys its file cache by the file that holds a function, so a kernel that calls one from another file keeps the
+old code of the other when that is edited. Kernels of this package are therefore cached in a folder whose name is a
+digest of all their sources:
+
+    <NUMBA_CACHE_DIR, or the user's cache directory>/marl_sched/kernels/<digest>
+
+A cache directory that cannot be written (a read-only installation without a home) is replaced by one in the folder
+for temporary files; a cache file that is damaged is compiled anew; a full disk costs the cache, not the run. Each is
+logged as a warning on the logger `marl_sched.kernels`.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import logging
+import os
+import pickle  # noqa: TID251  (Numba's own cache files are pickles; here only their errors are named)
+import stat
+import tempfile
+import time
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numba
+import platformdirs
+from numba.core.caching import FunctionCache
+
+log = logging.getLogger(__name__)
+
+_PACKAGES = ("marl_sched", "marl_sched.envs", "marl_sched.agents")
+_MARK = b"marl_sched.kernels"
+_UNUSED_AFTER = 30 * 24 * 3600  # seconds
+_DAMAGED = (EOFError, pickle.UnpicklingError, AttributeError, ImportError, IndexError, KeyError, TypeError, ValueError)
+
+
+def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
+    """Compile a function with `numba.njit` and keep the machine code in the package's cache.
+
+    Use as `@kernel`, or with options of `numba.njit` such as `@kernel(inline="always")`.
+    """
+    if function is None:
+        return functools.partial(kernel, **options)
+    dispatcher = numba.njit(**options)(function)
+    if isinstance(dispatcher, numba.core.dispatcher.Dispatcher):  # with NUMBA_DISABLE_JIT it is the plain function
+        dispatcher._cache = _cache_of(function)
+    return dispatcher
+
+
+def _cache_of(function: Callable[..., Any]) -> FunctionCache:
+    """A cache in the package's folder; Numba reads the folder from its configuration when the cache is made."""
+    before = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = str(cache_folder())
+    try:
+        return _KernelCache(function)
+    finally:
+        numba.config.CACHE_DIR = before
+
+
+class _KernelCache(FunctionCache):
+    """Numba's cache of one function, for which a damaged file or a full disk is no reason to stop."""
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """The machine code of a signature, None if there is none that can be read."""
+        try:
+            return super().load_overload(sig, target_context)
+        except _DAMAGED as error:
+            log.warning("the cached code of %s is damaged (%r): it is compiled anew", self._name, error)
+        except OSError as error:
+            log.warning("the cached code of %s cannot be read: %s", self._name, error)
+            return None
+        try:
+            self.flush()
+        except OSError as error:
+            log.warning("the cached code of %s cannot be replaced: %s", self._name, error)
+            self.disable()
+        return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep the machine code of a signature where that is possible."""
+        try:
+            super().save_overload(sig, data)
+        except OSError as error:
+            log.warning("compiled code cannot be kept in %s: %s", self.cache_path, error)
+            self.disable()
+
+
+@functools.cache
+def sources_digest() -> str:
+    """The first 16 hex digits of a SHA-256 over every source file of the package that defines or imports kernels.
+
+    Two runs with the same digest computed with the same simulators.
+    """
+    digest = hashlib.sha256(f"numba {numba.__version__}".encode())
+    for path in _sources():
+        content = path.read_bytes()
+        if _MARK in content:
+            digest.update(path.name.encode() + b"\0" + content + b"\0")
+    return digest.hexdigest()[:16]
+
+
+def _sources() -> list[Path]:
+    """The package's Python files, each once, in an order that does not depend on where it is installed."""
+    found: dict[tuple[str, str], Path] = {}
+    for package in _PACKAGES:
+        spec = find_spec(package)
+        for folder in (spec.submodule_search_locations or []) if spec is not None else []:
+            for path in Path(folder).rglob("*.py"):
+                name = path.relative_to(folder).as_posix()
+                room, _, inside = name.partition("/")
+                if package == "marl_sched" and f"marl_sched.{room}" in _PACKAGES:
+                    found[f"marl_sched.{room}", inside] = path  # a wheel holds the rooms inside the package
+                else:
+                    found[package, name] = path
+    return [found[key] for key in sorted(found)]
+
+
+@functools.cache
+def cache_folder() -> Path:
+    """Where compiled kernels are kept, made if it was not there; see the module's page."""
+    given = os.environ.get("NUMBA_CACHE_DIR")
+    usual = Path(given) / "marl_sched" if given else platformdirs.user_cache_path("marl_sched")
+    for parent, private in ((usual, False), (Path(tempfile.gettempdir()) / f"marl_sched-{_user()}", True)):
+        folder = parent / "kernels" / sources_digest()
+        try:
+            parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            if private and not _is_ours(parent):
+                continue
+            folder.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=folder).close()
+        except OSError as error:
+            log.warning("compiled kernels cannot be kept in %s: %s", folder, error)
+            continue
+        os.utime(folder)
+        _remove_unused(folder)
+        return folder
+    return Path(tempfile.mkdtemp(prefix="marl_sched-kernels-"))
+
+
+def _user() -> str:
+    return str(os.getuid()) if hasattr(os, "getuid") else "user"
+
+
+def _is_ours(folder: Path) -> bool:
+    """Whether nobody else can put code into a folder among the temporary files, from which code is loaded."""
+    if not hasattr(os, "getuid"):
+        return True
+    about = folder.lstat()
+    return stat.S_ISDIR(about.st_mode) and about.st_uid == os.getuid() and not about.st_mode & 0o022
+
+
+def _remove_unused(folder: Path) -> None:
+    """Remove the kernels of sources that nobody has used for a month."""
+    for other in folder.parent.iterdir():
+        if other != folder and other.is_dir() and time.time() - other.stat().st_mtime > _UNUSED_AFTER:
+            for path in sorted(other.rglob("*"), reverse=True):
+                _remove(path)
+            _remove(other)
+
+
+def _remove(path: Path) -> None:
+    try:
+        path.rmdir() if path.is_dir() else path.unlink()
+    except OSError as error:  # another process may have been first
+        log.debug("%s stays: %s", path, error)
