@@ -11,7 +11,6 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from marl_sched.agents.airme.ranking import CORRECTIVE, Known, Ranking, rank, ranking
 from marl_sched.compiled import entry
@@ -32,6 +31,7 @@ from marl_sched.envs.airme.dynamics import (
 from marl_sched.envs.airme.graph import TENTH
 from marl_sched.envs.airme.simulator import AirmeSimulator, example
 from marl_sched.envs.airme.views import ring_distance
+from marl_sched.kernels import kernel
 
 
 class EpochPlayer:
@@ -54,7 +54,7 @@ def _play() -> Any:
     return entry(play_epochs, *example(), np.zeros((1, 3), np.int64), ranking(CORRECTIVE), 1)
 
 
-@njit(cache=True)
+@kernel
 def play_epochs(state: State, rules: Rules, limits: np.ndarray, of: Ranking, count: int) -> tuple[float, int]:
     """Play up to `count` decision epochs in every row; `limits` int64 (B, 3), see marl_sched.envs.airme.views."""
     require_consistent(state, rules, limits.shape[0])
@@ -84,7 +84,7 @@ def play_epochs(state: State, rules: Rules, limits: np.ndarray, of: Ranking, cou
     return shares, turns
 
 
-@njit(cache=True)
+@kernel
 def play_queue(state: State, rules: Rules, b: int, of: Ranking, keys: np.ndarray, slots: np.ndarray) -> int:
     """The free crews of row b take planes off one queue, then hours pass; returns how many crews decided.
 
@@ -114,7 +114,7 @@ def play_queue(state: State, rules: Rules, b: int, of: Ranking, keys: np.ndarray
     return turns
 
 
-@njit(cache=True)
+@kernel
 def open_planes(state: State, rules: Rules, b: int, of: Ranking, keys: np.ndarray, slots: np.ndarray) -> int:
     """Write the planes of row b that nobody has in hand and the rule serves as a heap; returns their number."""
     row, planes = state.rows[b], state.planes[b]
@@ -132,7 +132,7 @@ def open_planes(state: State, rules: Rules, b: int, of: Ranking, keys: np.ndarra
     return queued
 
 
-@njit(cache=True)
+@kernel
 def sink(keys: np.ndarray, slots: np.ndarray, k: int, size: int) -> None:
     """Restore a heap of `size` entries below entry k: the highest key first, ties to the lowest slot."""
     key, slot = keys[k], slots[k]
@@ -149,13 +149,13 @@ def sink(keys: np.ndarray, slots: np.ndarray, k: int, size: int) -> None:
     keys[k], slots[k] = key, slot
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def before(key: float, slot: int, other_key: float, other_slot: int) -> bool:
     """Whether a plane is served before another."""
     return key > other_key or (key == other_key and slot < other_slot)
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def known(plane: Record) -> Known:
     """What a crew that sees this status of a plane knows of it."""
     return Known(
@@ -168,7 +168,7 @@ def known(plane: Record) -> Known:
     )
 
 
-@njit(cache=True)
+@kernel
 def choose(
     state: State, rules: Rules, b: int, limits: np.ndarray, of: Ranking, heard: np.ndarray, turn: int
 ) -> tuple[int, float]:

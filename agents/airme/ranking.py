@@ -13,11 +13,11 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from marl_sched.agents.airme.bound.plane import BROKEN, HOURS_CAP, LANDINGS_CAP
 from marl_sched.compiled import entry
 from marl_sched.envs.airme.graph import graph_spec
+from marl_sched.kernels import kernel
 
 CORRECTIVE, CORRECTIVE_AS_PUBLISHED, CONDITION, PERIODIC, MODEL_BASED, PREVENTIVE_FIRST, INDEX = range(7)
 FIRST = 1e9  # added to the rank of planes that go before all others
@@ -84,7 +84,7 @@ class Known(NamedTuple):
     to_go: int  # hours of the running mission that are left
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def between(nodes: np.ndarray, x: float) -> tuple[int, float]:
     """Index of the node below x and the share of the next one, within the ends of `nodes` float64 (N,)."""
     below = 0
@@ -97,7 +97,7 @@ def between(nodes: np.ndarray, x: float) -> tuple[int, float]:
     return below, min(max(share, 0.0), 1.0)
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def index_of(known: Known, time: float, tables: IndexTables) -> float:
     """A plane's index; -inf where it will not fail any more.
 
@@ -120,7 +120,7 @@ def index_of(known: Known, time: float, tables: IndexTables) -> float:
     return total
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def failure_probability(known: Known, failure: np.ndarray) -> float:
     """1 - prod(1 - p_k) over the parts of a plane, from float64 (n_types, n_parts, longest + 1)."""
     survival = 1.0
@@ -129,7 +129,7 @@ def failure_probability(known: Known, failure: np.ndarray) -> float:
     return 1.0 - survival
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def rank(known: Known, time: int, failure: np.ndarray, of: Ranking) -> float:
     """A plane's rank; -inf for one that the rule never serves."""
     if of.rule == INDEX:
@@ -174,7 +174,7 @@ def _ranks() -> Callable[..., None]:
     return entry(ranks, planes, planes[0, 0], legal, np.zeros((1, 1, 1)), ranking(CORRECTIVE), np.zeros((1, 1)))
 
 
-@njit(cache=True)
+@kernel
 def ranks(
     plane: np.ndarray, time: np.ndarray, legal: np.ndarray, failure: np.ndarray, of: Ranking, out: np.ndarray
 ) -> None:
@@ -192,7 +192,7 @@ def ranks(
                 out[b, slot] = rank(known, int(time[b]), failure, of)
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def known_from(features: np.ndarray) -> Known:
     """What an observation says of a plane, from its features float32 (F,)."""
     kind = -1

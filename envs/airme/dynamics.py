@@ -11,8 +11,8 @@ from enum import IntEnum
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
+from marl_sched.kernels import kernel
 from marl_sched.noise import FIRST_DOMAIN_STREAM, integer, time_key, uniform
 
 Record = Any  # one element of a record array, whose fields compiled code reads as attributes
@@ -118,7 +118,7 @@ _REPAIR_HOURS, _REPAIR_COST = int(Stream.REPAIR_HOURS), int(Stream.REPAIR_COST)
 _MISSION, _MISSION_HOURS, _FAILURE = int(Stream.MISSION), int(Stream.MISSION_HOURS), int(Stream.FAILURE)
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def start_repair(plane: Record, slot: int, crew: int, time_word: np.uint64) -> None:
     """Send a crew to a plane: draw the job's hours, then its cost; a running mission ends without a landing."""
     hours = integer(uniform(time_word, _REPAIR_HOURS, slot, 0), REPAIR_HOURS[0], REPAIR_HOURS[1])
@@ -137,7 +137,7 @@ def start_repair(plane: Record, slot: int, crew: int, time_word: np.uint64) -> N
     plane.mission_done = 0
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def fails(plane: Record, slot: int, failure: np.ndarray, time_word: np.uint64) -> bool:
     """Whether a part of a flying plane fails this hour, on the counters as they stood before the hour (eq. 6.1)."""
     for part in range(failure.shape[1]):
@@ -148,7 +148,7 @@ def fails(plane: Record, slot: int, failure: np.ndarray, time_word: np.uint64) -
     return False
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def fly(plane: Record, slot: int, usage: np.ndarray, failure: np.ndarray, time_word: np.uint64) -> None:
     """A plane's hour outside repair: it may start a mission, and while it flies it may fail."""
     if plane.broken:
@@ -167,7 +167,7 @@ def fly(plane: Record, slot: int, usage: np.ndarray, failure: np.ndarray, time_w
         plane.mission_done += 1
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def release(plane: Record, crews: np.ndarray) -> None:
     """End of the hour: a finished repair makes the plane new and the crew free, a finished mission lands."""
     if plane.crew >= 0:
@@ -188,7 +188,7 @@ def release(plane: Record, crews: np.ndarray) -> None:
         plane.mission_done = 0
 
 
-@njit(cache=True)
+@kernel
 def hour(state: State, rules: Rules, b: int) -> tuple[float, float, int, int]:
     """One hour of row b; returns (income, repair cost, planes available, planes broken).
 
@@ -230,7 +230,7 @@ def hour(state: State, rules: Rules, b: int) -> tuple[float, float, int, int]:
     return income, cost, available, broken
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def _status(plane: Record) -> int:
     if plane.crew >= 0:
         return REPAIR
@@ -239,7 +239,7 @@ def _status(plane: Record) -> int:
     return FLYING if plane.mission_hours > 0 else GROUNDED
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def next_free(crews: np.ndarray, n_crews: int) -> int:
     """The lowest crew that is free and undecided, -1 if there is none."""
     for crew in range(n_crews):
@@ -248,7 +248,7 @@ def next_free(crews: np.ndarray, n_crews: int) -> int:
     return -1
 
 
-@njit(cache=True)
+@kernel
 def decide(state: State, b: int, crew: int, action: int) -> None:
     """Note a crew's choice in row b; one that is impossible in truth idles the crew for this hour."""
     row, planes = state.rows[b], state.planes[b]
@@ -265,7 +265,7 @@ def decide(state: State, b: int, crew: int, action: int) -> None:
             state.private_memory_at[b, crew, action] = row.time
 
 
-@njit(cache=True)
+@kernel
 def pass_hour(state: State, rules: Rules, b: int) -> None:
     """Let one hour pass in row b, keep the books, and see whether the episode ends."""
     row, t = state.rows[b], state.rows[b].time
@@ -287,7 +287,7 @@ def pass_hour(state: State, rules: Rules, b: int) -> None:
         row.truncated = True
 
 
-@njit(cache=True)
+@kernel
 def pass_hour_with_memory(state: State, rules: Rules, b: int) -> None:
     """As `pass_hour`, for views in which crews remember: who finished a repair knows the plane as it left it."""
     row, crews = state.rows[b], state.crews[b]
@@ -302,7 +302,7 @@ def pass_hour_with_memory(state: State, rules: Rules, b: int) -> None:
             state.private_memory_at[b, crew, slot] = row.time
 
 
-@njit(cache=True)
+@kernel
 def begin_step(row: Record) -> None:
     """Forget what the last step brought."""
     row.reward = 0.0
@@ -310,7 +310,7 @@ def begin_step(row: Record) -> None:
     row.conflict = False
 
 
-@njit(cache=True)
+@kernel
 def require_consistent(state: State, rules: Rules, batch: int) -> None:
     """Raise ValueError where arrays do not belong together or a row does not fit into them: writing would go astray.
 
@@ -334,7 +334,7 @@ def require_consistent(state: State, rules: Rules, batch: int) -> None:
             raise ValueError("a row of this state runs on after its horizon")
 
 
-@njit(cache=True)
+@kernel
 def pass_hours(state: State, rules: Rules, b: int) -> None:
     """Let hours pass in row b, one at least, until a crew of it is free to act or the episode ends."""
     row, following = state.rows[b], -1
@@ -347,7 +347,7 @@ def pass_hours(state: State, rules: Rules, b: int) -> None:
     row.acting = -1 if row.terminated or row.truncated else following
 
 
-@njit(cache=True)
+@kernel
 def take_turn(state: State, rules: Rules, b: int, action: int) -> None:
     """The acting crew of row b, which is not over, chooses; after the last one of the hour hours pass."""
     row = state.rows[b]
@@ -361,7 +361,7 @@ def take_turn(state: State, rules: Rules, b: int, action: int) -> None:
         row.acting = following
 
 
-@njit(cache=True)
+@kernel
 def step(state: State, rules: Rules, actions: np.ndarray) -> int:
     """Take a turn, int64 (B,), in every row that is not over.
 
@@ -379,7 +379,7 @@ def step(state: State, rules: Rules, actions: np.ndarray) -> int:
     return -1
 
 
-@njit(cache=True)
+@kernel
 def first_outside(actions: np.ndarray, n_actions: int) -> int:
     """Flat index of the first of actions, int64 of any shape, that is not in [0, n_actions), -1 if there is none."""
     flat = actions.ravel()
@@ -389,7 +389,7 @@ def first_outside(actions: np.ndarray, n_actions: int) -> int:
     return -1
 
 
-@njit(cache=True)
+@kernel
 def play_hour(state: State, rules: Rules, choices: np.ndarray) -> int:
     """Play one hour in every row that is not over, with an action for each crew, int64 (B, C).
 

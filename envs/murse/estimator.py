@@ -14,9 +14,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from marl_sched.envs.murse.learning import BETA, C_STD, EXPONENTIAL, K_STD, C, K, remaining_share, sample_curves
+from marl_sched.kernels import kernel
 
 Record = Any  # one element of a record array, whose fields compiled code reads as attributes
 
@@ -65,7 +65,7 @@ def new_filters(prior: Prior, shape: tuple[int, ...]) -> np.ndarray:
     return filters
 
 
-@njit(cache=True)
+@kernel
 def linearised(state: Record, repetitions: int, learning: int) -> tuple[float, tuple[float, float, float]]:
     """Expected duration and its derivatives by c, k and log beta: (float, (float, float, float))."""
     k, beta = state.mean[1], np.exp(state.mean[2])
@@ -74,19 +74,19 @@ def linearised(state: Record, repetitions: int, learning: int) -> tuple[float, t
     return state.mean[0] + k * share, (1.0, share, slope)
 
 
-@njit(cache=True)
+@kernel
 def noise_ratio(state: Record, share: float) -> float:
     """The noise variance when `share` of k is left, relative to that of the first execution."""
     return 1.0 - state.k_noise_share * (1.0 - share**2)
 
 
-@njit(cache=True)
+@kernel
 def noise_variance(state: Record, share: float) -> float:
     """The present estimate of one execution's variance about the curve when `share` of k is left."""
     return noise_ratio(state, share) * state.noise_sum / (PRIOR_WEIGHT + state.updates)
 
 
-@njit(cache=True)
+@kernel
 def predict(state: Record, repetitions: int, learning: int) -> tuple[float, float]:
     """Mean and standard deviation (of curve and noise together) of the next duration before rounding and clipping."""
     expected, slopes = linearised(state, repetitions, learning)
@@ -97,7 +97,7 @@ def predict(state: Record, repetitions: int, learning: int) -> tuple[float, floa
     return expected, np.sqrt(variance)
 
 
-@njit(cache=True)
+@kernel
 def update(state: Record, repetitions: int, learning: int, observed: float) -> None:
     """Take in one observed whole duration of a human who had repeated the task `repetitions` times."""
     expected, slopes = linearised(state, repetitions, learning)
@@ -118,7 +118,7 @@ def update(state: Record, repetitions: int, learning: int, observed: float) -> N
     state.updates += 1
 
 
-@njit(cache=True)
+@kernel
 def predict_each(filters: np.ndarray, repetitions: np.ndarray, learning: int) -> tuple[np.ndarray, np.ndarray]:
     """`predict` for each of FILTER (n,) after int64 (n,) repetitions: two float64 (n,)."""
     means, stds = np.empty(len(filters)), np.empty(len(filters))
@@ -127,7 +127,7 @@ def predict_each(filters: np.ndarray, repetitions: np.ndarray, learning: int) ->
     return means, stds
 
 
-@njit(cache=True)
+@kernel
 def update_each(filters: np.ndarray, repetitions: np.ndarray, learning: int, observed: np.ndarray) -> None:
     """`update` for each of FILTER (n,), int64 (n,) repetitions and float64 (n,) observed durations."""
     for j in range(len(filters)):
