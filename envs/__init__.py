@@ -1,4 +1,8 @@
 """One folder per scheduling domain, and the environment APIs that every domain gets for free."""
 
-from marl_sched.envs.airme import domain as _airme  # noqa: F401  (registers the domain)
-from marl_sched.envs.murse import domain as _murse  # noqa: F401  (registers the domain)
+# The domains that ship with the package, the default of the command line first: name -> where it is declared.
+# It is imported when it is asked for. Domains of other distributions come by entry points (marl_sched.plugins).
+DOMAINS = {
+    "airme": "marl_sched.envs.airme.domain:AIRME",
+    "murse": "marl_sched.envs.murse.domain:MURSE",
+}

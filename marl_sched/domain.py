@@ -1,11 +1,13 @@
-"""The registry of domains: what a folder of `envs/` declares for every environment API, policy and command.
+"""The registry of domains: what a domain declares so that every environment API, policy and command works with it.
 
-A third domain costs one folder that builds a `Domain` and calls `register`, and one line in
-`marl_sched.envs` that imports it.
+A domain of another distribution is found by its entry point (marl_sched.plugins) and costs no line here; those that
+ship with the package are named in `marl_sched.envs`. A domain is imported when it is asked for by name, and the parts
+that it declares as `Lazy` when they are used.
 """
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -15,8 +17,9 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, get_type_hints
 
 import numpy as np
 
-from marl_sched.errors import InvalidOptionError, require
+from marl_sched.errors import InvalidOptionError, MarlSchedError, require
 from marl_sched.noise import as_seed
+from marl_sched.plugins import DOMAINS, import_object, load_offered, offered
 
 if TYPE_CHECKING:
     from gymnasium.spaces import Space
@@ -31,8 +34,11 @@ class Instance(Protocol):
     def identity(self) -> int:
         """A 64-bit hash of the content: the instance's name in counter-based randomness."""
 
+    def as_json(self) -> dict[str, Any]:
+        """Plain data from which the domain's `decode` makes the instance again."""
+
     def save(self, path: Path) -> None:
-        """Write as JSON, whole or not at all."""
+        """Write `as_json` to a file, whole or not at all."""
 
 
 class CentralInterface(Protocol):
@@ -105,6 +111,7 @@ class Domain:
         agent_prefix: agents are called `<prefix>_<i>`.
         generate: (scale, rng) -> instance.
         load: path -> instance; raises InvalidFileError.
+        decode: (plain data, where) -> the instance that its `as_json` wrote; InvalidFileError names `where`.
         instance_type: the class of its instances.
         simulator: (instances, **options) -> TurnSimulator. Every domain understands the options `view`,
             `objective`, `horizon`, `seed` and `pad` (a scale's name whose largest instance sets the padding,
@@ -118,6 +125,11 @@ class Domain:
         telemetry: how the state travels to deployed agents; None: the domain cannot be deployed.
         reference: name of the scheduler over which M2 is the gain; None: results have no M2.
         cli_options: options of the command line that the domain has, without dashes -> the simulator's argument.
+        schedulers: scheduler's name -> factory, or `package.module:attribute` of such a table; more may be added by
+            entry points of the group `marl_sched.schedulers`.
+        feasible: instance -> whether a schedule of it can be feasible, found by search; None: nothing tells.
+        benchmarks: (domain, batch) -> what `marl-sched bench` measures of this domain alone; None: nothing.
+        bound: the module, by its name, that proves upper bounds (`Relaxation` and `upper_bounds`); None: none is known.
         generate_accepted: (scale, rng, accept) -> an instance that `accept` takes, redrawn until it does; None:
             every generated instance can be solved.
         impossibilities: instance -> why no schedule of it can be feasible, a sentence each; empty if none is known.
@@ -134,6 +146,7 @@ class Domain:
     agent_prefix: str
     generate: Callable[[str, np.random.Generator], Any]
     load: Callable[[Path], Any]
+    decode: Callable[[Any, str | Path], Any]
     instance_type: type
     simulator: Callable[..., TurnSimulator]
     central: CentralInterface
@@ -145,6 +158,10 @@ class Domain:
     better: Literal["higher", "lower"] = "higher"
     reference: str | None = None
     cli_options: Mapping[str, str] = field(default_factory=dict)
+    schedulers: Mapping[str, Callable[..., Any]] | str = field(default_factory=dict)
+    feasible: Callable[[Any], bool] | None = None
+    benchmarks: Callable[[Any, int], Mapping[str, Any]] | None = None
+    bound: str | None = None
     generate_accepted: Callable[[str, np.random.Generator, Callable[[Any], bool]], Any] | None = None
     impossibilities: Callable[[Any], list[str]] = _none_known
     legend: Mapping[str, Sequence[int]] | None = None
@@ -178,6 +195,17 @@ class Domain:
     def require_objective(self, objective: str) -> str:
         """The objective's name, or UnknownNameError."""
         return require(f"objective of {self.name}", objective, self.objectives)
+
+    @property
+    def simulator_options(self) -> dict[str, Any]:
+        """The simulator's own options, those that no other word of a `Problem` stands for: name -> default."""
+        parameters = inspect.signature(self.simulator).parameters.values()
+        return {one.name: one.default for one in parameters if one.name not in _NAMED_BY_PROBLEM}
+
+    def require_options(self, options: Mapping[str, Any]) -> None:
+        """UnknownNameError for an option that the domain's simulator does not have; it checks the values itself."""
+        for name in options:
+            require(f"option of {self.name}", name, self.simulator_options)
 
     def view(self, kind: str, /, **options: Any) -> Any:
         """The view of that kind with those options; raises as `make_view`."""
@@ -217,6 +245,9 @@ def _as_number(where: str, value: Any, kind: type) -> Any:
     return kind(value)
 
 
+# Arguments of every domain's simulator that have fields of their own in a Problem.
+_NAMED_BY_PROBLEM = frozenset({"instances", "view", "objective", "horizon", "seed", "pad"})
+
 _DOMAINS: dict[str, Domain] = {}
 
 
@@ -229,15 +260,27 @@ def register(domain: Domain) -> Domain:
 
 
 def get_domain(name: str) -> Domain:
-    """The domain of that name, or UnknownNameError that lists the known ones."""
-    import marl_sched.envs  # noqa: F401  (registers the domains that ship with the package)
+    """The domain of that name, imported now if it was not before; UnknownNameError lists the known ones.
 
-    require("environment", name, _DOMAINS)
-    return _DOMAINS[name]
+    Raises MarlSchedError for an entry point that does not lead to a domain of its name.
+    """
+    if name in _DOMAINS:
+        return _DOMAINS[name]
+    require("environment", name, domain_names())
+    shipped = _shipped()
+    found = import_object(shipped[name]) if name in shipped else load_offered(offered(DOMAINS)[name])
+    if not isinstance(found, Domain) or found.name != name:
+        raise MarlSchedError(f"entry point {name} of {DOMAINS}: expected a Domain of that name, got {found!r}")
+    return _DOMAINS.setdefault(name, found)
 
 
 def domain_names() -> list[str]:
-    """Names of all registered domains, sorted."""
-    import marl_sched.envs  # noqa: F401
+    """Names of all domains that can be had, without importing them: those of the package first, the others sorted."""
+    shipped = list(_shipped())
+    return shipped + sorted({*_DOMAINS, *offered(DOMAINS)} - set(shipped))
 
-    return sorted(_DOMAINS)
+
+def _shipped() -> Mapping[str, str]:
+    from marl_sched import envs
+
+    return envs.DOMAINS

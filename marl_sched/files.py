@@ -40,15 +40,25 @@ def write_json(path: str | Path, data: Any) -> None:
 def read_json(path: str | Path) -> Any:
     """The JSON value in a file; InvalidFileError says where it is malformed or why it cannot be read.
 
-    NaN and Infinity, which are not JSON, are refused.
+    NaN and Infinity, which are not JSON, are refused, and so is a key that an object has twice.
     """
     path = Path(path)
 
     def refuse(constant: str) -> None:
         raise ValueError(f"{constant} is none of its numbers")
 
+    def as_object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        known: dict[str, Any] = {}
+        for key, value in pairs:
+            if key in known:
+                raise InvalidFileError(path, key, "a key that its object has once", (known[key], value))
+            known[key] = value
+        return known
+
     try:
-        return json.loads(path.read_bytes(), parse_constant=refuse)
+        return json.loads(path.read_bytes(), parse_constant=refuse, object_pairs_hook=as_object)
+    except InvalidFileError:
+        raise
     except OSError as error:
         raise InvalidFileError(path, "", f"a readable file ({error.strerror})") from error
     except UnicodeDecodeError as error:

@@ -55,6 +55,9 @@ class TurnSimulator(ABC):
         conflict: bool (B,), the last choice was legal in the agent's view and impossible in truth.
         terminated, truncated: bool (B,), how the episode ended, false while it runs.
         episode_keys: uint64 (B,), counter-based randomness of the running episodes (marl_sched.noise).
+        unit: what the length of an episode is counted in, in the plural; as `Domain.unit`, such as "hours", "rounds".
+        time_unit: what `time` and `elapsed` count, in the plural; mostly the same.
+        horizon: length of an episode in `unit`, at most.
         graph: the metagraph of the observations.
         arrays: name -> ArraySpec of the observation's arrays.
     """
@@ -73,6 +76,9 @@ class TurnSimulator(ABC):
     terminated: np.ndarray
     truncated: np.ndarray
     episode_keys: np.ndarray
+    unit: str
+    time_unit: str
+    horizon: int
     graph: GraphSpec
     arrays: Mapping[str, ArraySpec]
     _observed: Observation | None = None  # the arrays of observe_acting
@@ -151,6 +157,43 @@ class TurnSimulator(ABC):
         """Measures of each round of an episode, name -> float64 (B, rounds), NaN where there is nothing to measure.
 
         Empty for domains whose episodes have no rounds.
+        """
+        return {}
+
+    @property
+    def length(self) -> np.ndarray:
+        """Int64 (B,), the length of each env's episode in `unit` if nothing ends it early; the horizon, mostly."""
+        return np.full(self.batch, self.horizon, np.int64)
+
+    @property
+    def progress(self) -> np.ndarray:
+        """Int64 (B,), how many `unit`s of its episode have passed in each env, from 0 to `length`.
+
+        It never falls within an episode. Whoever cuts episodes into pieces cuts by it; discounts use `elapsed`.
+        """
+        return self.time
+
+    @property
+    def progress_share(self) -> np.ndarray:
+        """Float64 (B,), the share of its episode that has passed in each env; 1 where it is over."""
+        return np.where(self.over, 1.0, self.progress / self.length)
+
+    @property
+    def presence(self) -> Mapping[str, np.ndarray]:
+        """Node type -> bool (B, n), which padded slots hold a node now; types that are left out never change.
+
+        Nodes come and go during an episode: work arrives and is cancelled, an agent joins and leaves. A node that
+        is not there has a zero mask in every observation, is never acting and never legal to choose. A slot that
+        stands for doing nothing is always present.
+        """
+        return {}
+
+    @property
+    def availability(self) -> Mapping[str, np.ndarray]:
+        """Node type -> bool (B, n), which present nodes can be used now; types that are left out always can.
+
+        An agent that is away for a while keeps its slot and its mask, and has no turn until it is back. A node type
+        that is named here has the feature `available`, which holds this value wherever the node is visible.
         """
         return {}
 

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from msgspec import Meta, Struct
 
 from marl_sched.envs.airme.aircraft import PUBLISHED_TYPES, AircraftType
 from marl_sched.errors import InvalidFileError, InvalidOptionError, UnknownNameError
 from marl_sched.files import read_json, write_json
+from marl_sched.structs import convert
 
 SCHEMA = 1
 MOST_INCOME = 1e9  # sums over a fleet stay finite
@@ -77,8 +77,8 @@ class AirmeInstance:
             digest.update(getattr(self, name).astype(np.dtype(dtype).newbyteorder("<")).tobytes())
         return int.from_bytes(digest.digest(), "little")
 
-    def save(self, path: str | Path) -> None:
-        """Write as JSON, one object per plane."""
+    def as_json(self) -> dict[str, Any]:
+        """Plain data, one object per plane, from which `decode` makes the instance again."""
         planes = [
             {
                 "type": self.types[self.kind[p]].name,
@@ -90,9 +90,14 @@ class AirmeInstance:
             for p in range(self.n_planes)
         ]
         types = [asdict(kind) for kind in self.types]
-        write_json(path, {"schema": SCHEMA, "env": "airme", "n_crews": self.n_crews, "types": types, "planes": planes})
+        return {"schema": SCHEMA, "env": "airme", "n_crews": self.n_crews, "types": types, "planes": planes}
+
+    def save(self, path: str | Path) -> None:
+        """Write `as_json` to a file, whole or not at all."""
+        write_json(path, self.as_json())
 
 
+_INCOME_BOUNDS = f"bounds 0 < low <= high <= {MOST_INCOME:.0e}"
 _INCOME = f"a number in (0, {MOST_INCOME:.0e}] (per flying hour)"
 _ARRAYS: dict[str, type] = {
     "kind": np.int32,
@@ -153,94 +158,74 @@ def generate(scale: str, rng: np.random.Generator, types: tuple[AircraftType, ..
     )
 
 
+class _Type(Struct, forbid_unknown_fields=True):
+    """An aircraft type as a file has it."""
+
+    name: Annotated[str, Meta(min_length=1, description="a name")]
+    scales: Annotated[
+        list[Annotated[float, Meta(gt=0)]], Meta(min_length=1, description="numbers > 0, one for each part")
+    ]
+    shapes: Annotated[list[Annotated[float, Meta(gt=0)]], Meta(description="numbers > 0, as many as scales")]
+    hour_norm: Annotated[float, Meta(gt=0, description="a number > 0")]
+    usage: Annotated[float, Meta(ge=0, le=1, description="a probability in [0, 1]")]
+    income: Annotated[list[float], Meta(min_length=2, max_length=2, description=_INCOME_BOUNDS)]
+
+
+class _Plane(Struct, forbid_unknown_fields=True):
+    """A plane as a file has it."""
+
+    type: Annotated[str, Meta(description="an aircraft type's name")]
+    income: Annotated[float, Meta(gt=0, le=MOST_INCOME, description=_INCOME)]
+    hours: Annotated[int, Meta(ge=0, le=MOST, description=f"an integer in [0, {MOST}]")]
+    landings: Annotated[int, Meta(ge=0, le=MOST, description=f"an integer in [0, {MOST}]")]
+    broken: Annotated[bool, Meta(description="true or false")]
+
+
+class _File(Struct, forbid_unknown_fields=True):
+    """An instance as a file has it."""
+
+    schema: Annotated[Literal[1], Meta(description=f"{SCHEMA}")]
+    env: Annotated[Literal["airme"], Meta(description="'airme'")]
+    n_crews: Annotated[int, Meta(ge=1, le=MOST, description=f"an integer in [1, {MOST}]")]
+    types: Annotated[list[_Type], Meta(min_length=1, description="a list that is not empty")]
+    planes: Annotated[list[_Plane], Meta(min_length=1, description="a list that is not empty")]
+
+
 def load(path: str | Path) -> AirmeInstance:
-    """Read an instance; InvalidFileError names the file, the field and what was expected."""
-    data = read_json(path)
-    reader = _Reader(Path(path))
-    reader.check("", data, isinstance(data, dict), "an object")
-    reader.check("schema", data.get("schema"), data.get("schema") == SCHEMA, f"{SCHEMA}")
-    reader.check("env", data.get("env"), data.get("env") == "airme", "'airme'")
-    crews = reader.take(data, "", "n_crews", _is_count, f"an integer in [1, {MOST}]")
-    types = tuple(_read_type(reader, f"types[{i}]", row) for i, row in enumerate(reader.rows(data, "types")))
+    """Read an instance; InvalidFileError names the file, the field, what was expected and what was found."""
+    return decode(read_json(path), path)
+
+
+def decode(data: Any, where: str | Path) -> AirmeInstance:
+    """The instance that `AirmeInstance.as_json` wrote; InvalidFileError names `where` and the field."""
+    file = convert(data, _File, where)
+    types = tuple(_as_type(kind, f"types[{i}]", where) for i, kind in enumerate(file.types))
     names = {kind.name: i for i, kind in enumerate(types)}
-    reader.check("types", [kind.name for kind in types], len(names) == len(types), "names that differ")
-    columns: dict[str, list[Any]] = {name: [] for name in _ARRAYS}
-    for p, row in enumerate(reader.rows(data, "planes")):
-        where = f"planes[{p}]"
-        name = reader.take(row, where, "type", lambda v: isinstance(v, str) and v in names, f"one of {[*names]}")
-        columns["kind"].append(names[name])
-        columns["income"].append(reader.take(row, where, "income", _is_income, _INCOME))
-        columns["hours"].append(reader.take(row, where, "hours", _is_natural, f"an integer in [0, {MOST}]"))
-        columns["landings"].append(reader.take(row, where, "landings", _is_natural, f"an integer in [0, {MOST}]"))
-        columns["broken"].append(reader.take(row, where, "broken", lambda v: isinstance(v, bool), "true or false"))
-    return AirmeInstance(n_crews=crews, types=types, **{name: np.array(rows) for name, rows in columns.items()})
-
-
-class _Reader:
-    """Checks fields of one file and names the file in every complaint."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def check(self, where: str, value: Any, good: bool, expected: str) -> None:
-        if not good:
-            raise InvalidFileError(self.path, where, expected, value)
-
-    def take(self, row: Any, where: str, field: str, good: Callable[[Any], bool], expected: str) -> Any:
-        place = f"{where}.{field}" if where else field
-        if not isinstance(row, dict):
-            raise InvalidFileError(self.path, where, "an object", row)
-        if field not in row:
-            raise InvalidFileError(self.path, place, f"{expected}; the field is missing")
-        if not good(row[field]):
-            raise InvalidFileError(self.path, place, expected, row[field])
-        return row[field]
-
-    def rows(self, data: dict[str, Any], field: str) -> list[Any]:
-        rows = self.take(data, "", field, lambda v: isinstance(v, list) and len(v) > 0, "a list that is not empty")
-        return list(rows)
-
-
-def _read_type(reader: _Reader, where: str, row: Any) -> AircraftType:
-    def numbers(field: str, expected: str, good: Callable[[list[float]], bool]) -> tuple[float, ...]:
-        def fits(value: Any) -> bool:
-            return isinstance(value, list) and all(map(_is_number, value)) and good(value)
-
-        return tuple(reader.take(row, where, field, fits, expected))
-
-    name = reader.take(row, where, "name", lambda v: isinstance(v, str) and v != "", "a name")
-    scales = numbers("scales", "numbers > 0, one for each part", lambda v: len(v) > 0 and min(v) > 0)
-    low, high = numbers("income", f"bounds 0 < low <= high <= {MOST_INCOME:.0e}", _are_incomes)
-    return AircraftType(
-        name=name,
-        scales=scales,
-        shapes=numbers("shapes", f"{len(scales)} numbers > 0", lambda v: len(v) == len(scales) and min(v) > 0),
-        hour_norm=reader.take(row, where, "hour_norm", _is_positive, "a number > 0"),
-        usage=reader.take(row, where, "usage", lambda v: _is_number(v) and 0 <= v <= 1, "a probability in [0, 1]"),
-        income=(low, high),
+    if len(names) != len(types):
+        raise InvalidFileError(where, "types", "names that differ", [kind.name for kind in types])
+    for p, plane in enumerate(file.planes):
+        if plane.type not in names:
+            raise InvalidFileError(where, f"planes[{p}].type", f"one of {[*names]}", plane.type)
+    return AirmeInstance(
+        n_crews=file.n_crews,
+        types=types,
+        kind=np.array([names[plane.type] for plane in file.planes]),
+        **{name: np.array([getattr(plane, name) for plane in file.planes]) for name in _ARRAYS if name != "kind"},
     )
 
 
-def _is_number(value: Any) -> bool:
-    # The comparison is exact for JSON's unbounded integers, and false for NaN.
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
-
-
-def _is_positive(value: Any) -> bool:
-    return _is_number(value) and value > 0
-
-
-def _is_income(value: Any) -> bool:
-    return _is_positive(value) and value <= MOST_INCOME
-
-
-def _are_incomes(values: list[float]) -> bool:
-    return len(values) == 2 and 0 < values[0] <= values[1] <= MOST_INCOME
-
-
-def _is_natural(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= MOST
-
-
-def _is_count(value: Any) -> bool:
-    return _is_natural(value) and value >= 1
+def _as_type(kind: _Type, place: str, where: str | Path) -> AircraftType:
+    """A type of the fleet; what one field alone cannot show is checked here."""
+    if len(kind.shapes) != len(kind.scales):
+        raise InvalidFileError(where, f"{place}.shapes", f"{len(kind.scales)} numbers > 0", kind.shapes)
+    low, high = kind.income
+    if not 0 < low <= high <= MOST_INCOME:
+        raise InvalidFileError(where, f"{place}.income", _INCOME_BOUNDS, kind.income)
+    return AircraftType(
+        name=kind.name,
+        scales=tuple(kind.scales),
+        shapes=tuple(kind.shapes),
+        hour_norm=kind.hour_norm,
+        usage=kind.usage,
+        income=(low, high),
+    )

@@ -41,6 +41,8 @@ class AirmeSimulator(TurnSimulator):
     Raises InvalidOptionError or UnknownNameError for options outside their domain.
     """
 
+    unit = time_unit = "hours"
+
     def __init__(
         self,
         instances: Sequence[AirmeInstance],

@@ -2,41 +2,41 @@
 
 from __future__ import annotations
 
-from marl_sched.domain import Domain, register
+from marl_sched.domain import Domain
 from marl_sched.envs.murse import render
 from marl_sched.envs.murse.central import RoundSchedules
 from marl_sched.envs.murse.formats import load
 from marl_sched.envs.murse.generate import SCALES, generate
 from marl_sched.envs.murse.instance import MurseInstance
+from marl_sched.envs.murse.reading import decode
 from marl_sched.envs.murse.rules import OBJECTIVES
 from marl_sched.envs.murse.simulator import DEFAULT_HORIZON, MurseSimulator
 from marl_sched.envs.murse.views import VIEWS
 
-MURSE = register(
-    Domain(
-        name="murse",
-        title="robots and humans who learn share tasks under deadlines, waits and safety distances",
-        scales=SCALES,
-        objectives=OBJECTIVES,
-        views=VIEWS,
-        agent_prefix="agent",
-        generate=generate,
-        load=load,
-        instance_type=MurseInstance,
-        simulator=MurseSimulator,
-        central=RoundSchedules(),
-        render={"ansi": render.board, "rgb_array": render.gantt},
-        default_horizon=DEFAULT_HORIZON,
-        unit="rounds",
-        better="lower",
-        cli_options={
-            "rounds": "horizon",
-            "mode": "mode",
-            "durations": "durations",
-            "proximity": "proximity",
-            "picking": "picking",
-        },
-        generate_accepted=generate,
-        impossibilities=MurseInstance.impossibilities,
-    )
+MURSE = Domain(
+    name="murse",
+    title="robots and humans who learn share tasks under deadlines, waits and safety distances",
+    scales=SCALES,
+    objectives=OBJECTIVES,
+    views=VIEWS,
+    agent_prefix="agent",
+    generate=generate,
+    load=load,
+    decode=decode,
+    instance_type=MurseInstance,
+    simulator=MurseSimulator,
+    central=RoundSchedules(),
+    render={"ansi": render.board, "rgb_array": render.gantt},
+    default_horizon=DEFAULT_HORIZON,
+    unit="rounds",
+    better="lower",
+    cli_options={
+        "rounds": "horizon",
+        "mode": "mode",
+        "durations": "durations",
+        "proximity": "proximity",
+        "picking": "picking",
+    },
+    generate_accepted=generate,
+    impossibilities=MurseInstance.impossibilities,
 )

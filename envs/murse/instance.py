@@ -230,9 +230,13 @@ class MurseInstance:
             humans[i, h] = self.duration_range[0] if noisy[i, h] else whole(best, *self.duration_range)
         return np.hstack([self.robot_durations, humans])
 
+    def as_json(self) -> dict[str, object]:
+        """Plain data, one object per task, from which `reading.decode` makes the instance again; tasks count from 1."""
+        return {"schema": SCHEMA, "env": "murse", **self._settings(), "tasks": self._tasks()}
+
     def save(self, path: str | Path) -> None:
-        """Write as JSON, one object per task; tasks are numbered from 1."""
-        write_json(path, {"schema": SCHEMA, "env": "murse", **self._settings(), "tasks": self._tasks()})
+        """Write `as_json` to a file, whole or not at all."""
+        write_json(path, self.as_json())
 
     def _settings(self) -> dict[str, object]:
         names = (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -12,11 +12,12 @@ from marl_sched.envs.murse.instance import NO_DEADLINE, SCHEMA, MurseInstance
 from marl_sched.envs.murse.learning import CURVE
 from marl_sched.errors import InvalidFileError, InvalidOptionError
 from marl_sched.files import read_json
+from marl_sched.structs import convert
 
-_Natural = Annotated[int, msgspec.Meta(ge=0, lt=2**31)]
-_Count = Annotated[int, msgspec.Meta(ge=1, lt=2**31)]
-_Positive = Annotated[float, msgspec.Meta(gt=0)]
-_Magnitude = Annotated[float, msgspec.Meta(ge=0)]
+_Natural = Annotated[int, msgspec.Meta(ge=0, lt=2**31, description="an integer in [0, 2**31)")]
+_Count = Annotated[int, msgspec.Meta(ge=1, lt=2**31, description="an integer in [1, 2**31)")]
+_Positive = Annotated[float, msgspec.Meta(gt=0, description="a number > 0")]
+_Magnitude = Annotated[float, msgspec.Meta(ge=0, description="a number >= 0")]
 
 
 class _Curve(msgspec.Struct, forbid_unknown_fields=True):
@@ -43,7 +44,7 @@ class _Task(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class _File(msgspec.Struct, forbid_unknown_fields=True):
-    schema: Literal[1]
+    schema: Annotated[Literal[1], msgspec.Meta(description=f"{SCHEMA}")]
     env: Literal["murse"]
     n_robots: _Natural
     n_humans: _Natural
@@ -59,22 +60,20 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
 
 def load(path: str | Path) -> MurseInstance:
     """Read an instance; InvalidFileError names the file, the field and what was expected."""
-    data = read_json(path)
-    if isinstance(data, dict) and data.get("schema") != SCHEMA:
-        raise InvalidFileError(path, "schema", f"{SCHEMA}", data.get("schema"))
-    try:
-        file = msgspec.convert(data, _File)
-    except msgspec.ValidationError as error:
-        expected, _, field = str(error).partition(" - at `$")
-        raise InvalidFileError(path, field.rstrip("`").lstrip("."), expected.removeprefix("Expected ")) from error
+    return decode(read_json(path), path)
+
+
+def decode(data: Any, where: str | Path) -> MurseInstance:
+    """The instance that `MurseInstance.as_json` wrote; InvalidFileError names `where` and the field."""
+    file = convert(data, _File, where)
     for i, task in enumerate(file.tasks):
         for name, count in (("robots", file.n_robots), ("humans", file.n_humans)):
             if len(getattr(task, name)) != count:
-                raise InvalidFileError(path, f"tasks[{i}].{name}", f"{count} entries", len(getattr(task, name)))
+                raise InvalidFileError(where, f"tasks[{i}].{name}", f"{count} entries", len(getattr(task, name)))
     try:
         return _instance(file)
     except InvalidOptionError as error:
-        raise InvalidFileError(path, "", f"a possible problem ({error})") from error
+        raise InvalidFileError(where, "", f"a possible problem ({error})") from error
 
 
 def _instance(file: _File) -> MurseInstance:

@@ -48,6 +48,8 @@ class MurseSimulator(TurnSimulator):
     Raises InvalidOptionError or UnknownNameError for options outside their domain.
     """
 
+    unit, time_unit = "rounds", "time units"
+
     def __init__(
         self,
         instances: Sequence[MurseInstance],
@@ -219,6 +221,16 @@ class MurseSimulator(TurnSimulator):
         free = np.flatnonzero(free_at <= self.state.rows["clock"][row])
         keys = [dynamics.preference(self.state, self.rules.picking, row, int(agent)) for agent in free]
         return free[np.argsort(keys, kind="stable")]
+
+    @property
+    def length(self) -> np.ndarray:
+        """Int64 (B,), rounds of each env's episode: those of its instance, at most `horizon`."""
+        return self.state.rows["n_rounds"].astype(np.int64)
+
+    @property
+    def progress(self) -> np.ndarray:
+        """Int64 (B,), rounds that have ended."""
+        return self.state.rows["round"].astype(np.int64)
 
     def objectives(self) -> dict[str, np.ndarray]:
         """Means over the rounds that have ended, float64 (B,), conflicts summed; 0 before the first has ended.

@@ -108,3 +108,10 @@ def test_what_python_reads_differently_from_json_or_not_at_all_is_refused(tmp_pa
     path.write_text(content)
     with pytest.raises(InvalidFileError, match=rf"odd\.json: {message}"):
         read_json(path)
+
+
+def test_a_key_that_an_object_has_twice_is_refused(tmp_path):
+    path = tmp_path / "twice.json"
+    path.write_text('{"planes": [{"hours": 1, "hours": 2}]}')
+    with pytest.raises(InvalidFileError, match=r"twice\.json: hours: expected a key .* once, got \(1, 2\)"):
+        read_json(path)

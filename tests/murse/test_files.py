@@ -137,10 +137,16 @@ def edited(path: Path, edit) -> Path:
     ("edit", "complaint"),
     [
         (lambda d: d["tasks"][2].pop("location"), "tasks[2]"),
-        (lambda d: d["tasks"][0]["robots"].__setitem__(0, -3), "tasks[0].robots[0]"),
-        (lambda d: d["tasks"][1].__setitem__("deadline", "soon"), "tasks[1].deadline"),
-        (lambda d: d.__setitem__("proximity", "far"), "proximity"),
-        (lambda d: d.__setitem__("colour", 1), "unknown field `colour`"),
+        (
+            lambda d: d["tasks"][0]["robots"].__setitem__(0, -3),
+            "tasks[0].robots[0]: expected an integer in [0, 2**31), got -3",
+        ),
+        (
+            lambda d: d["tasks"][1].__setitem__("deadline", "soon"),
+            "tasks[1].deadline: expected an integer in [0, 2**31), got 'soon'",
+        ),
+        (lambda d: d.__setitem__("proximity", "far"), ", got 'far'"),
+        (lambda d: d.__setitem__("colour", 1), "colour: expected one of schema, env, n_robots"),
         (lambda d: d.__setitem__("schema", 9), "schema: expected 1, got 9"),
         (lambda d: d["tasks"][0]["robots"].append(4), "tasks[0].robots"),
         (lambda d: d["tasks"][0].__setitem__("waits", [{"after": 1, "time": 3}]), "tasks 1 -> 1 wait for one another"),
