@@ -22,13 +22,77 @@ it in PettingZoo and Gymnasium. For a node type `plane` with n padded slots and 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
+
+from marl_sched.errors import require
 
 Pattern = Literal["all", "same", "scatter", "gather", "dense"]
 STATE, DECISION = "state", "decision"
 ACTION_MASK, TIME, VISIBLE_SHARE = "action_mask", "time", "visible_share"
+AVAILABLE = "available"  # the feature of nodes that can be away for a while; see TurnSimulator.availability
+
+
+@dataclass(frozen=True)
+class Feature:
+    """A quantity of a node, and the scale by which an observation divides it.
+
+    `whole`: the quantity is an integer, and is read back as one whatever the rounding of float32.
+    """
+
+    name: str
+    scale: float = 1.0
+    whole: bool = False
+
+    @property
+    def label(self) -> str:
+        """`hours/10`: how a metagraph, and so a policy's card, names the feature."""
+        return self.name if self.scale == 1 else f"{self.name}/{self.scale:g}"
+
+
+class Features:
+    """The features of a node type in the order of the last axis; writes and reads them in their own units.
+
+    PLANE = Features(Feature("hours", 10, whole=True), Feature("broken"))
+    PLANE.read(observation["plane"], "hours")        # float64 (B, n), in hours
+    """
+
+    def __init__(self, *features: Feature) -> None:
+        self._features = features
+        self._index = {feature.name: k for k, feature in enumerate(features)}
+        if len(self._index) != len(features):
+            raise ValueError(f"features: expected names that differ, got {[feature.name for feature in features]}")
+
+    def __len__(self) -> int:
+        """How many there are."""
+        return len(self._features)
+
+    def __add__(self, more: Features) -> Features:
+        """These features, then `more`."""
+        return Features(*self._features, *more._features)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """What a NodeType names them."""
+        return tuple(feature.label for feature in self._features)
+
+    def index(self, name: str) -> int:
+        """The place of a feature in the last axis; UnknownNameError for a name that none has."""
+        return self._index[require("feature", name, self._index)]
+
+    def read(self, array: np.ndarray, name: str) -> np.ndarray:
+        """A quantity in its own unit, float64 (...), from an observation's float32 (..., f)."""
+        index = self.index(name)
+        feature = self._features[index]
+        value = np.asarray(array[..., index], np.float64) * feature.scale
+        return np.rint(value) if feature.whole else value
+
+    def write(self, array: np.ndarray, where: Any, **values: Any) -> None:
+        """Write quantities, given in their own units, into float32 (..., f) at the nodes `where`."""
+        for name, value in values.items():
+            index = self.index(name)
+            array[where, index] = np.asarray(value, np.float64) / self._features[index].scale
 
 
 @dataclass(frozen=True)
