@@ -2,24 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from typing import Protocol
 
 import numpy as np
 
 from marl_sched.agents.base import Scheduler
 from marl_sched.simulation import TurnSimulator
 
-Watcher = Callable[[TurnSimulator, int], None]
-"""Called before each decision with the simulator and the number of the decision, from 0."""
+EPOCHS_AT_ONCE = 24  # between two looks of a watcher, where a scheduler plays decision epochs in compiled code
 
 
-def play(scheduler: Scheduler, simulator: TurnSimulator, watch: Watcher | None = None) -> TurnSimulator:
+class Watcher(Protocol):
+    """Who looks on while episodes are played."""
+
+    def before(self, simulator: TurnSimulator, number: int) -> None:
+        """Called before each decision, `number` counts them from 0."""
+
+    def played(self, simulator: TurnSimulator, shares: float, decisions: int) -> None:
+        """Called after decisions in compiled code: how many, and the sum of the visible shares of some of them."""
+
+
+def play(scheduler: Scheduler, simulator: TurnSimulator, watcher: Watcher | None = None) -> TurnSimulator:
     """Play every env of a simulator from the start of its episode to the end; returns the simulator."""
     scheduler.start(simulator, np.ones(simulator.batch, np.bool_))
+    player = scheduler.epoch_player(simulator)
     number = 0
     while (simulator.acting >= 0).any():
-        if watch is not None:
-            watch(simulator, number)
+        if player is not None:
+            shares, decisions = player(EPOCHS_AT_ONCE)
+            if watcher is not None:
+                watcher.played(simulator, shares, decisions)
+            continue
+        if watcher is not None:
+            watcher.before(simulator, number)
         simulator.step(scheduler.decide(simulator))
         number += 1
     return simulator

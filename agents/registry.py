@@ -1,23 +1,23 @@
 """Schedulers by name: a domain's rules, the policies that ship with the package, and checkpoints by path.
 
-A domain's rules stand in one table, `RULES` (name -> factory), in `marl_sched.agents.<domain>.schedulers`, which is
-imported when it is asked for; where instances may be infeasible, `IS_FEASIBLE` there tells. PyTorch is imported only
-when a policy is loaded.
+A domain's rules stand in one table (`Domain.schedulers`); any distribution adds to it by entry points of the group
+`marl_sched.schedulers`, named `<domain>.<scheduler>`. A scheduler of no table is named as `package.module:factory`.
+All of it is imported when it is asked for, PyTorch only when a policy is loaded.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import cache
-from importlib import import_module
-from importlib.util import find_spec
+from functools import cache, partial
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from marl_sched.agents.base import Scheduler
 from marl_sched.agents.policies.cards import Mode, PolicyCard, read_card
-from marl_sched.domain import Domain
-from marl_sched.errors import InvalidFileError, MarlSchedError, UnknownNameError
+from marl_sched.domain import Domain, get_domain
+from marl_sched.errors import InvalidFileError, InvalidOptionError, MarlSchedError, UnknownNameError
+from marl_sched.plugins import SCHEDULERS, import_object, is_object_name, load_offered, offered
 
 if TYPE_CHECKING:
     from marl_sched.agents.policies.network_policy import NetworkPolicy
@@ -27,20 +27,31 @@ SHIPPED = Path(__file__).resolve().parent / "policies" / "shipped"
 _SUFFIXES = (".safetensors", ".json")
 
 
-def rules(domain: str) -> Mapping[str, Callable[..., Scheduler]]:
-    """The rules of a domain, name -> factory; empty for a domain without any."""
-    module = f"marl_sched.agents.{domain}.schedulers"
-    if find_spec(f"marl_sched.agents.{domain}") is None or find_spec(module) is None:
-        return {}
-    return import_module(module).RULES
+def rules(domain: Domain | str) -> Mapping[str, Callable[..., Scheduler]]:
+    """The rules of a domain, name -> factory: its own table, then those that other distributions offer, sorted.
+
+    Raises InvalidOptionError where an offered one has the name of another.
+    """
+    domain = domain if isinstance(domain, Domain) else get_domain(domain)
+    table = domain.schedulers
+    found = dict(import_object(table) if isinstance(table, str) else table)
+    for name, point in sorted(offered(SCHEDULERS).items()):
+        owner, _, scheduler = name.partition(".")
+        if owner != domain.name:
+            continue
+        if scheduler in found:
+            raise InvalidOptionError(f"{SCHEDULERS}: {name}: expected a name that {owner} does not have yet")
+        found[scheduler] = partial(_create_offered, point)
+    return found
 
 
-def feasibility(domain: str) -> Callable[[Any], bool] | None:
-    """What tells whether an instance is feasible: `IS_FEASIBLE` beside the domain's rules; None: nothing."""
-    module = f"marl_sched.agents.{domain}.schedulers"
-    if find_spec(f"marl_sched.agents.{domain}") is None or find_spec(module) is None:
-        return None
-    return getattr(import_module(module), "IS_FEASIBLE", None)
+def _create_offered(point: EntryPoint, **options: Any) -> Scheduler:
+    return load_offered(point)(**options)
+
+
+def feasibility(domain: Domain | str) -> Callable[[Any], bool] | None:
+    """What tells whether an instance is feasible (`Domain.feasible`); None: nothing."""
+    return (domain if isinstance(domain, Domain) else get_domain(domain)).feasible
 
 
 @cache
@@ -55,7 +66,7 @@ def scheduler_names(domain: str) -> list[str]:
 
 
 def create_scheduler(name_or_path: str | Path, domain: Domain | str, **options: Any) -> Scheduler:
-    """The scheduler of that name, or the policy in that file, for a domain.
+    """The scheduler of that name, of that `package.module:factory`, or the policy in that file, for a domain.
 
     `options` are those of the rule, or of `load_policy`; unknown ones raise TypeError. Raises
     UnknownNameError for a name that nobody has, and InvalidFileError for a file that is damaged or holds
@@ -65,12 +76,22 @@ def create_scheduler(name_or_path: str | Path, domain: Domain | str, **options: 
     table = rules(domain_name)
     if str(name_or_path) in table:
         return table[str(name_or_path)](**options)
+    if is_object_name(str(name_or_path)):
+        return _create_named(str(name_or_path), options)
     _require_known(name_or_path, domain_name)
     policy = load_policy(name_or_path, **options)
     if policy.card is not None and policy.card.domain != domain_name:
         card_path = Path(name_or_path).with_suffix(".json")
         raise InvalidFileError(card_path, "domain", f"a policy for {domain_name}", policy.card.domain)
     return policy
+
+
+def _create_named(where: str, options: Mapping[str, Any]) -> Scheduler:
+    """The scheduler that a factory, named as `package.module:factory`, makes; InvalidOptionError if it is none."""
+    made = import_object(where)(**options)
+    if not isinstance(made, Scheduler):
+        raise InvalidOptionError(f"{where}: expected a factory of a Scheduler, got {type(made).__name__}")
+    return made
 
 
 def load_policy(name_or_path: str | Path, *, mode: Mode | None = None, graph: GraphSpec | None = None) -> NetworkPolicy:
@@ -98,7 +119,7 @@ def card_of(name_or_path: str | Path, domain: Domain | str) -> PolicyCard | None
     Raises UnknownNameError for a name that nobody has, InvalidFileError for a damaged card.
     """
     domain_name = domain if isinstance(domain, str) else domain.name
-    if str(name_or_path) in rules(domain_name):
+    if str(name_or_path) in rules(domain_name) or is_object_name(str(name_or_path)):
         return None
     _require_known(name_or_path, domain_name)
     return read_card(policy_path(name_or_path).with_suffix(".json"))

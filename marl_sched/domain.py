@@ -99,6 +99,29 @@ def _none_known(instance: Any) -> list[str]:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Demo:
+    """What `marl-sched demo` shows of a domain: one deployed episode, then a comparison on other instances.
+
+    Attributes:
+        scale, objective, seed: of the deployed episode.
+        policy: what decides unless the user says otherwise.
+        local_rules: rules that play beside it under its view.
+        central_rules: rules that play with the full view, the first and the last also in the picture of the episode.
+        comparison_seed, instances, episodes: of the comparison.
+    """
+
+    scale: str
+    objective: str
+    policy: str
+    local_rules: tuple[str, ...]
+    central_rules: tuple[str, ...]
+    seed: int = 0
+    comparison_seed: int = 90_001
+    instances: int = 10
+    episodes: int = 2
+
+
+@dataclass(frozen=True, kw_only=True)
 class Domain:
     """One scheduling problem as the rooms see it.
 
@@ -124,7 +147,6 @@ class Domain:
         better: whether a scheduler with a higher or a lower M1 is the better one.
         telemetry: how the state travels to deployed agents; None: the domain cannot be deployed.
         reference: name of the scheduler over which M2 is the gain; None: results have no M2.
-        cli_options: options of the command line that the domain has, without dashes -> the simulator's argument.
         schedulers: scheduler's name -> factory, or `package.module:attribute` of such a table; more may be added by
             entry points of the group `marl_sched.schedulers`.
         feasible: instance -> whether a schedule of it can be feasible, found by search; None: nothing tells.
@@ -133,6 +155,7 @@ class Domain:
         generate_accepted: (scale, rng, accept) -> an instance that `accept` takes, redrawn until it does; None:
             every generated instance can be solved.
         impossibilities: instance -> why no schedule of it can be feasible, a sentence each; empty if none is known.
+        demo: what `marl-sched demo` shows; None: nothing.
         legend: what the colours of the `rgb_array` picture mean, meaning -> RGB in 0 .. 255; None: it needs none.
         band: what a band of the `rgb_array` picture is and how many pixels high, such as ("plane", 4); None: the
             picture brings axes of its own.
@@ -157,13 +180,13 @@ class Domain:
     unit: str = "hours"
     better: Literal["higher", "lower"] = "higher"
     reference: str | None = None
-    cli_options: Mapping[str, str] = field(default_factory=dict)
     schedulers: Mapping[str, Callable[..., Any]] | str = field(default_factory=dict)
     feasible: Callable[[Any], bool] | None = None
     benchmarks: Callable[[Any, int], Mapping[str, Any]] | None = None
     bound: str | None = None
     generate_accepted: Callable[[str, np.random.Generator, Callable[[Any], bool]], Any] | None = None
     impossibilities: Callable[[Any], list[str]] = _none_known
+    demo: Demo | None = None
     legend: Mapping[str, Sequence[int]] | None = None
     band: tuple[str, int] | None = None
 
@@ -201,6 +224,11 @@ class Domain:
         """The simulator's own options, those that no other word of a `Problem` stands for: name -> default."""
         parameters = inspect.signature(self.simulator).parameters.values()
         return {one.name: one.default for one in parameters if one.name not in _NAMED_BY_PROBLEM}
+
+    def view_options(self, kind: str) -> dict[str, Any]:
+        """The options of a view of that kind: name -> default; UnknownNameError for a kind that there is not."""
+        view_type = self.views[require(f"view of {self.name}", kind, self.views)]
+        return {option.name: option.default for option in fields(view_type)}
 
     def require_options(self, options: Mapping[str, Any]) -> None:
         """UnknownNameError for an option that the domain's simulator does not have; it checks the values itself."""

@@ -12,13 +12,15 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from marl_sched.domain import get_domain
 from marl_sched.errors import InvalidOptionError, require
 from marl_sched.train.config import RunRecord, load_record
 from marl_sched.train.evaluation.compare import read_curve
 from marl_sched.train.export import CONFIG
 
-SCHEMA = 1
-AXES = {"updates": "update", "hours": "hours", "seconds": "seconds"}  # what may be on the x-axis -> its column
+SCHEMA = 2  # 1 had no unit
+# What may be on the x-axis -> its column in a log, the name it had before version 0.2 last.
+AXES = {"updates": ("update",), "time": ("time", "hours"), "seconds": ("seconds",)}
 MEASURES = ("reward_rate", "validation")
 SMOOTHED = {"reward_rate": 10, "validation": 1}  # points that are averaged over unless another number is asked for
 
@@ -35,18 +37,19 @@ def learning_curves(
 
     Args:
         runs: folders of runs.
-        x: "updates", "hours" (simulated, over all rows) or "seconds" (wall time).
+        x: "updates", "time" (simulated, over all envs) or "seconds" (wall time).
         measure: "reward_rate", M1 of the sampling policy in training, or "validation", on fixed instances.
         smooth: a point is the mean of so many, itself the last; None: see SMOOTHED.
         by: runs with the same value of this key of their configuration are a group, for example `view.reach`. The
             algorithm of `algorithm=reinforce` is step_baseline, with other settings; `policy.name` tells them apart.
 
-    Returns `{"schema", "x", "measure", "smooth", "by", "groups": {NAME: {"mean": {"x": [...], "y": [...]}, "runs":
-    [{"run", "seed", "x": [...], "y": [...]}]}}}`. A group's mean is over its runs, on the points of the run that has
-    fewest, as far as all of them went; between its points a run is taken to be linear.
+    Returns `{"schema", "x", "unit", "measure", "smooth", "by", "groups": {NAME: {"mean": {"x": [...], "y": [...]},
+    "runs": [{"run", "seed", "x": [...], "y": [...]}]}}}`; `unit` is that of simulated time. A group's mean is over its
+    runs, on the points of the run that has fewest, as far as all of them went; between its points a run is taken to be
+    linear.
     Raises InvalidFileError for a folder without a run's files, InvalidOptionError or UnknownNameError for the rest.
     """
-    column = AXES[require("x-axis", x, AXES)]
+    require("x-axis", x, AXES)
     require("measure", measure, MEASURES)
     smooth = SMOOTHED[measure] if smooth is None else smooth
     if smooth < 1:
@@ -56,11 +59,12 @@ def learning_curves(
     found: dict[str, list[dict[str, Any]]] = {}
     for run in runs:
         record = load_record(run / CONFIG)
-        xs, ys = read_curve(run / "progress.csv", column, measure)
+        unit = get_domain(record.config.env.name).unit
+        xs, ys = read_curve(run / "progress.csv", AXES[x], measure)
         curve = {"run": run.absolute().name, "seed": record.config.seed, "x": xs.tolist()}
         found.setdefault(_group(record, by), []).append(curve | {"y": trailing_mean(ys, smooth).tolist()})
     groups = {name: {"mean": _mean(curves), "runs": curves} for name, curves in found.items()}
-    return {"schema": SCHEMA, "x": x, "measure": measure, "smooth": smooth, "by": by, "groups": groups}
+    return {"schema": SCHEMA, "x": x, "unit": unit, "measure": measure, "smooth": smooth, "by": by, "groups": groups}
 
 
 def trailing_mean(values: np.ndarray, count: int) -> np.ndarray:

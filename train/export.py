@@ -12,8 +12,9 @@ from marl_sched.agents.policies.cards import PolicyCard
 from marl_sched.agents.policies.checkpoint import load_network, save_network
 from marl_sched.agents.policies.network_policy import NetworkPolicy
 from marl_sched.domain import Domain, get_domain
+from marl_sched.problem import Problem
 from marl_sched.train.config import RunRecord, load_record
-from marl_sched.train.evaluation.evaluate import Settings, evaluate_scheduler
+from marl_sched.train.evaluation.evaluate import evaluate_scheduler
 
 CONFIG, BEST = "config.json", "policy.safetensors"  # in a run's directory
 
@@ -78,17 +79,19 @@ def export_policy(
     view = domain.make_view(card.view)
     measured = {}
     for scale in _readable(network, domain) if scales is None else scales:
-        settings = Settings(
+        problem = Problem(
+            domain,
+            scale=scale,
+            count=instances,
             episodes=episodes,
             seed=seed,
             view=view,
             objective=card.objective,
             horizon=length,
-            scale=scale,
             options=options,
         )
         policy = NetworkPolicy(network, mode=card.mode)
-        scores = evaluate_scheduler(domain, policy, domain.instances(scale, instances, seed), settings)
+        scores = evaluate_scheduler(problem, policy)
         means = scores.measures[card.objective].mean(axis=1)
         measured[scale] = {
             "M1": float(means.mean()),

@@ -5,8 +5,9 @@ from __future__ import annotations
 from marl_sched.agents.networks.network import PolicyNetwork
 from marl_sched.agents.policies.network_policy import NetworkPolicy
 from marl_sched.domain import Domain, get_domain
+from marl_sched.problem import Problem
 from marl_sched.train.config import TrainConfig
-from marl_sched.train.evaluation.evaluate import Settings, evaluate_scheduler
+from marl_sched.train.evaluation.evaluate import evaluate_scheduler
 
 
 class Validation:
@@ -15,15 +16,17 @@ class Validation:
     def __init__(self, config: TrainConfig) -> None:
         self._mode = config.validation.mode
         self._domain: Domain = get_domain(config.env.name)
-        first, largest = config.env.scales[0], max(config.env.scales, key=list(self._domain.scales).index)
-        self._instances = self._domain.instances(first, config.validation.instances, config.validation.seed)
-        self._settings = Settings(
+        scales = config.env.scales
+        self._problem = Problem(
+            self._domain,
+            scale=scales[0],
+            count=config.validation.instances,
+            pad=max(scales, key=list(self._domain.scales).index),  # whose padding some networks are bound to
             episodes=config.validation.episodes,
             seed=config.validation.seed,
             view=config.make_view(),
             objective=config.env.objective,
             horizon=config.validation.length,
-            scale=largest,  # whose padding some networks are bound to
             options=config.env.options,
         )
 
@@ -34,5 +37,5 @@ class Validation:
     def __call__(self, network: PolicyNetwork) -> float:
         """M1, the mean over instances and episodes."""
         policy = NetworkPolicy(network, mode=self._mode)
-        scores = evaluate_scheduler(self._domain, policy, self._instances, self._settings)
-        return float(scores.measures[str(self._settings.objective)].mean())
+        scores = evaluate_scheduler(self._problem, policy)
+        return float(scores.measures[self._problem.objective].mean())

@@ -42,3 +42,6 @@ class HourlyDecisions:
                 break
         simulator.play_hour(choices[None])
         return float(simulator.reward[0]), {"illegal": illegal}
+
+
+CENTRAL = HourlyDecisions()

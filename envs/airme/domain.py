@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from marl_sched.domain import Domain
+from marl_sched.domain import Demo, Domain
 from marl_sched.envs.airme import render
-from marl_sched.envs.airme.central import HourlyDecisions
 from marl_sched.envs.airme.dynamics import OBJECTIVES
 from marl_sched.envs.airme.instance import SCALES, AirmeInstance, decode, generate, load
 from marl_sched.envs.airme.simulator import DEFAULT_HORIZON, AirmeSimulator
-from marl_sched.envs.airme.telemetry import AirmeTelemetry
 from marl_sched.envs.airme.views import VIEWS
+from marl_sched.plugins import lazy
 
 AIRME = Domain(
     name="airme",
@@ -23,13 +22,22 @@ AIRME = Domain(
     decode=decode,
     instance_type=AirmeInstance,
     simulator=AirmeSimulator,
-    central=HourlyDecisions(),
+    central=lazy("marl_sched.envs.airme.central:CENTRAL"),
     render={"ansi": render.fleet_board, "rgb_array": render.timeline},
     render_options={"rgb_array": {"record_timeline": True}},
     default_horizon=DEFAULT_HORIZON,
-    telemetry=AirmeTelemetry(),
+    telemetry=lazy("marl_sched.envs.airme.telemetry:TELEMETRY"),
     reference="corrective-published",  # section 6.5.2
-    cli_options={"hours": "horizon", "failure": "failure", "scheme": "scheme"},
+    schedulers="marl_sched.agents.airme.schedulers:RULES",
+    benchmarks=lazy("marl_sched.agents.airme.bench:benchmarks"),
+    bound="marl_sched.agents.airme.bound.relaxation",
+    demo=Demo(
+        scale="small",
+        objective="profit",
+        policy="airme-local-profit",
+        local_rules=("condition", "preventive-first"),
+        central_rules=("corrective", "condition", "model-based", "preventive-first"),
+    ),
     legend=render.LEGEND,
     band=("plane", render.CELL),
 )

@@ -298,3 +298,6 @@ def _empty_state(frame: Frame) -> State:
         for name, value in unknown.items():
             planes[name] = value
     return state
+
+
+TELEMETRY = AirmeTelemetry()

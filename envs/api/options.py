@@ -4,26 +4,17 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any
 
 from marl_sched.domain import Domain, get_domain
-from marl_sched.errors import InvalidOptionError
+from marl_sched.problem import as_instance
+
+__all__ = ["all_options", "as_domain", "as_instance"]
 
 
 def as_domain(domain: str | Domain) -> Domain:
     """A domain from its name, or itself; UnknownNameError lists the known names."""
     return domain if isinstance(domain, Domain) else get_domain(domain)
-
-
-def as_instance(domain: Domain, instance: Any) -> Any:
-    """An instance from a path to its file, or itself; InvalidOptionError for anything else."""
-    if isinstance(instance, str | Path):
-        return domain.load(Path(instance))
-    if not isinstance(instance, domain.instance_type):
-        expected = domain.instance_type.__name__
-        raise InvalidOptionError(f"instance: expected {expected} or a file's path, got {type(instance).__name__}")
-    return instance
 
 
 def all_options(constructor: Callable[..., Any], given: Mapping[str, Any]) -> dict[str, Any]:

@@ -66,3 +66,6 @@ def _play_online(simulator: MurseSimulator, tasks: np.ndarray, agents: np.ndarra
         simulator.step(np.array([queue.pop(0) + 1 if ready else 0]))
         reward += float(simulator.reward[0])
     return reward
+
+
+CENTRAL = RoundSchedules()

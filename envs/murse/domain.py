@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from marl_sched.domain import Domain
-from marl_sched.envs.murse import render
-from marl_sched.envs.murse.central import RoundSchedules
 from marl_sched.envs.murse.formats import load
 from marl_sched.envs.murse.generate import SCALES, generate
 from marl_sched.envs.murse.instance import MurseInstance
@@ -12,6 +10,7 @@ from marl_sched.envs.murse.reading import decode
 from marl_sched.envs.murse.rules import OBJECTIVES
 from marl_sched.envs.murse.simulator import DEFAULT_HORIZON, MurseSimulator
 from marl_sched.envs.murse.views import VIEWS
+from marl_sched.plugins import lazy
 
 MURSE = Domain(
     name="murse",
@@ -25,18 +24,17 @@ MURSE = Domain(
     decode=decode,
     instance_type=MurseInstance,
     simulator=MurseSimulator,
-    central=RoundSchedules(),
-    render={"ansi": render.board, "rgb_array": render.gantt},
+    central=lazy("marl_sched.envs.murse.central:CENTRAL"),
+    render={
+        "ansi": lazy("marl_sched.envs.murse.render:board"),
+        "rgb_array": lazy("marl_sched.envs.murse.render:gantt"),
+    },
     default_horizon=DEFAULT_HORIZON,
     unit="rounds",
     better="lower",
-    cli_options={
-        "rounds": "horizon",
-        "mode": "mode",
-        "durations": "durations",
-        "proximity": "proximity",
-        "picking": "picking",
-    },
+    schedulers="marl_sched.agents.murse.schedulers:RULES",
+    feasible=lazy("marl_sched.agents.murse.schedulers:IS_FEASIBLE"),
+    benchmarks=lazy("marl_sched.agents.murse.bench:benchmarks"),
     generate_accepted=generate,
     impossibilities=MurseInstance.impossibilities,
 )

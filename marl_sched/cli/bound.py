@@ -2,71 +2,83 @@
 
 from __future__ import annotations
 
+import inspect
+from dataclasses import dataclass
 from importlib import import_module
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from marl_sched.cli import options
-from marl_sched.errors import InvalidOptionError
+from marl_sched.cli.grouped import DOMAIN_OPTIONS, OwnOptions, takes
+from marl_sched.errors import InvalidOptionError, require
 
 if TYPE_CHECKING:
     import numpy as np
 
+    from marl_sched.problem import Problem
+
+SCHEMA = 2  # 1 named the horizon by its unit and had no other option of the simulator than `failure`
+
 
 def add_to(app: typer.Typer) -> None:
     """Register this file's commands."""
-    app.command(epilog="Example: marl-sched bound --env airme --scale small --instances 20 --json bound.json")(bound)
+    example = f"Example: marl-sched bound --env {options.DEFAULT_ENV} --scale small --instances 20 --json bound.json"
+    app.command(epilog=example, context_settings=DOMAIN_OPTIONS)(takes(Bounded)(bound))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bounded:
+    """The problem to be bounded; each field but `own` is an option."""
+
+    env: options.Env = options.DEFAULT_ENV
+    scale: options.Scale = None
+    instances: options.Instances = "20"
+    seed: options.Seed = 0
+    objective: options.Objective = None
+    own: OwnOptions
+
+    def problem(self) -> Problem:
+        """The problem that the words state."""
+        return options.state_problem(
+            self.env,
+            self.own,
+            instances=self.instances,
+            scale=self.scale,
+            seed=self.seed,
+            objective=self.objective,
+        )
 
 
 def bound(
-    env: options.Env = "airme",
-    scale: options.Scale = "small",
-    instances: Annotated[
-        str, typer.Option("--instances", metavar="N|DIR", help="How many to generate, or a folder of instance files.")
-    ] = "20",
-    seed: options.Seed = 0,
-    hours: options.Hours = None,
-    objective: Annotated[
-        str | None, typer.Option("--objective", help="What M1 is the mean of (default: the environment's first).")
-    ] = None,
-    failure: Annotated[str, typer.Option("--failure", help="airme: density as published, or hazard.")] = "density",
+    bounded: Bounded,
+    *,
     price_vectors: Annotated[
         int, typer.Option("--price-vectors", min=1, help="Price vectors to share; one per instance is the tightest.")
     ] = 5,
     json: options.JsonFile = None,
 ) -> None:
-    """Prove an upper bound on the M1 that any scheduler can reach, for every instance.
+    """Prove a bound on the M1 that any scheduler can reach, for every instance.
 
-    The crews' constraint is relaxed at a price that varies over the episode; what remains is solved exactly,
-    plane by plane. Takes a minute or so per price vector.
+    What couples the instance's parts is relaxed at a price that varies over the episode; what remains is solved
+    exactly, part by part. Takes a minute or so per price vector.
     """
-    from marl_sched.domain import get_domain
     from marl_sched.files import write_json
 
-    domain = get_domain(env)
-    chosen = domain.require_objective(objective or domain.objectives[0])
     options.check_output(json)
-    problems, padded_to = options.load_instances(domain, instances, scale, seed)
-    relaxation, values = _prove(
-        env,
-        problems,
-        price_vectors,
-        objective=chosen,
-        horizon=hours or domain.default_horizon,
-        failure=failure,
-    )
+    problem = bounded.problem()
+    values = _prove(problem, price_vectors)
     result: dict[str, Any] = {
-        "schema": 1,
-        "env": env,
-        "scale": padded_to,
-        "objective": chosen,
-        "failure": failure,
-        "instances": len(problems),
-        "hours": relaxation.horizon,
-        "seed": seed,
-        "price_vectors": min(price_vectors, len(problems)),
+        "schema": SCHEMA,
+        "env": problem.domain.name,
+        "scale": problem.pad,
+        "objective": problem.objective,
+        "options": dict(problem.options),
+        "instances": problem.count,
+        "horizon": problem.horizon,
+        "unit": problem.unit,
+        "seed": problem.seed,
+        "price_vectors": min(price_vectors, problem.count),
         "M1": {"mean": float(values.mean()), "std": float(values.std())},
         "per_instance": [float(value) for value in values],
     }
@@ -75,27 +87,31 @@ def bound(
     typer.echo(_sentence(result))
 
 
-def _prove(env: str, problems: list[Any], price_vectors: int, **settings: Any) -> tuple[Any, np.ndarray]:
-    """The relaxation of a domain's problems and the bound of each, float64 (B,); a spinner tells how far it is."""
+def _prove(problem: Problem, price_vectors: int) -> np.ndarray:
+    """The bound of each instance, float64 (B,); a spinner tells how far it is."""
     from rich.console import Console
 
-    package = f"marl_sched.agents.{env}.bound"
-    if find_spec(package) is None:
-        raise InvalidOptionError(f"--env: no bound is known for the environment {env!r}")
-    bounds = import_module(f"{package}.relaxation")
+    if problem.domain.bound is None:
+        raise InvalidOptionError(f"--env: no bound is known for the environment {problem.domain.name!r}")
+    bounds = import_module(problem.domain.bound)
+    known = inspect.signature(bounds.Relaxation).parameters
+    for name in problem.options:
+        require(f"option of the bound of {problem.domain.name}", name, known)
     with Console(stderr=True).status("bounding") as status:
-        relaxation = bounds.Relaxation(problems, **settings)
+        relaxation = bounds.Relaxation(
+            problem.instances, objective=problem.objective, horizon=problem.horizon, **problem.options
+        )
         found = bounds.upper_bounds(
             relaxation,
             price_vectors=price_vectors,
             progress=lambda done, total: status.update(f"price vector {done + 1} of {total}"),
         )
-    return relaxation, found.value
+    return found.value
 
 
 def _sentence(result: dict[str, Any]) -> str:
     return (
         f"{result['env']}, {result['scale'] or 'given'} instances: no scheduler's expected M1 for "
         f"{result['objective']} passes {result['M1']['mean']:.4f} ± {result['M1']['std']:.4f} "
-        f"({result['instances']} instances, {result['hours']} hours)"
+        f"({result['instances']} instances, {result['horizon']} {result['unit']})"
     )

@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from marl_sched.cli import options
-from marl_sched.cli.grouped import takes
+from marl_sched.cli.grouped import DOMAIN_OPTIONS, OwnOptions, takes
 from marl_sched.errors import InvalidOptionError
 
 if TYPE_CHECKING:
     from marl_sched.comms.options import WorldOptions
+    from marl_sched.problem import Problem
 
-_PROBLEM = "--env airme --scale small --seed 1 --hours 720 --view local --reach 1 --comm 1"
+_PROBLEM = f"--env {options.DEFAULT_ENV} --scale small --seed 1 --view local --reach 1 --comm 1"
 
 Policy = Annotated[str, typer.Option("--policy", help="A rule's or shipped policy's name, or a checkpoint's path.")]
 Json = options.JsonFile
@@ -25,34 +26,26 @@ Json = options.JsonFile
 
 def add_to(app: typer.Typer) -> None:
     """Register this file's commands."""
-    app.command(epilog=f"Example: marl-sched world {_PROBLEM} --listen tcp/127.0.0.1:7447 --json run.json")(
-        takes(Plant)(world)
-    )
+    example = f"Example: marl-sched world {_PROBLEM} --listen tcp/127.0.0.1:7447 --json run.json"
+    app.command(epilog=example, context_settings=DOMAIN_OPTIONS)(takes(Plant)(world))
     app.command(epilog="Example: marl-sched agent --agent 3 --policy condition --connect tcp/127.0.0.1:7447")(agent)
-    app.command(
-        epilog=f"Example: marl-sched deploy {_PROBLEM} --policy airme-local-profit --agent-policy crew_3=condition "
-        "--json run.json"
-    )(takes(Plant)(deploy))
+    example = f"Example: marl-sched deploy {_PROBLEM} --policy random --agent-policy crew_3=condition --json run.json"
+    app.command(epilog=example, context_settings=DOMAIN_OPTIONS)(takes(Plant)(deploy))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Plant:
-    """What `world` and `deploy` are told of the problem and of the run; each field is an option."""
+    """What `world` and `deploy` are told of the problem and of the run; each field but `own` is an option."""
 
-    env: options.Env = "airme"
-    scale: options.Scale = "small"
+    env: options.Env = options.DEFAULT_ENV
+    scale: options.Scale = None
     instance: Annotated[
         Path | None,
         typer.Option("--instance", metavar="FILE", help="An instance file (default: the first that the seed draws)."),
     ] = None
     seed: options.Seed = 0
-    hours: options.Hours = None
-    objective: Annotated[str | None, typer.Option("--objective", help="Default: the environment's first.")] = None
+    objective: options.Objective = None
     view: options.View = "full"
-    reach: options.Reach = None
-    comm: options.Comm = None
-    staleness: options.Staleness = None
-    sensing: options.Sensing = None
     run: Annotated[str, typer.Option("--run", help="The run's name, by which its processes find each other.")] = "run"
     deadline: Annotated[float, typer.Option("--deadline", help="Seconds that a decision may take.")] = 2.0
     patience: Annotated[
@@ -61,24 +54,38 @@ class Plant:
     ready_timeout: Annotated[
         float, typer.Option("--ready-timeout", help="Seconds to wait for all agents at the start.")
     ] = 60.0
+    own: OwnOptions
+
+    def problem(self) -> Problem:
+        """The problem that the words state; typed errors for words that stand for nothing."""
+        return options.state_problem(
+            self.env,
+            self.own,
+            instances=self.instance,
+            scale=self.scale,
+            view=self.view,
+            seed=self.seed,
+            objective=self.objective,
+            episodes=1,
+        )
 
     def world_options(self, listen: str, json: Path | None) -> WorldOptions:
-        """These options as the world process takes them; typed errors for words that stand for nothing."""
+        """These options as the world process takes them."""
         from marl_sched.comms.options import WorldOptions
-        from marl_sched.domain import get_domain
 
         options.check_output(json)
-        typed = {name: getattr(self, name) for name in options.VIEW_OPTIONS}
-        view = options.build_view(get_domain(self.env), self.view, typed)
+        problem = self.problem()
+        if problem.options:
+            raise InvalidOptionError(f"{', '.join(problem.options)}: a deployed world has no options of the simulator")
         return WorldOptions(
             env=self.env,
-            scale=self.scale,
+            scale=problem.scale or next(iter(problem.domain.scales)),
             instance=str(self.instance or ""),
             seed=self.seed,
-            hours=self.hours or 0,
-            objective=self.objective or "",
-            view=self.view,
-            view_options=asdict(view),
+            hours=problem.horizon,
+            objective=problem.objective,
+            view=problem.view.kind,
+            view_options=asdict(problem.view),
             run=self.run,
             listen=listen,
             deadline=self.deadline,
@@ -137,14 +144,12 @@ def deploy(
     from marl_sched.agents.registry import card_of
     from marl_sched.comms.launcher import deploy as launch
     from marl_sched.comms.options import DeployOptions
-    from marl_sched.domain import get_domain
 
     by_agent = _by_agent(agent_policy or [])
+    problem = plant.problem()
     chosen = DeployOptions(world=plant.world_options(listen, json), policy=policy, agent_policies=by_agent)
-    domain = get_domain(plant.env)
-    view = domain.view(chosen.world.view, **chosen.world.view_options)
     for name in dict.fromkeys([policy, *by_agent.values()]):
-        options.tell_of_training(name, card_of(name, domain), view, plant.objective or domain.objectives[0])
+        options.tell_of_training(name, card_of(name, problem.domain), problem.view, problem.objective)
     with progress_bar() as tell:
         report = launch(chosen, tell)
     print_report(report)

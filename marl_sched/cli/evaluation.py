@@ -8,21 +8,21 @@ from typing import Annotated, Any
 import typer
 
 from marl_sched.cli import options
-from marl_sched.cli.grouped import takes
+from marl_sched.cli.grouped import DOMAIN_OPTIONS, takes
 from marl_sched.cli.selection import Resolved, Selection
 
 _SELECTORS = (
-    "--env airme --scale small --instances 100 --episodes 10 --schedulers corrective,condition,preventive-first"
+    f"--env {options.DEFAULT_ENV} --scale small --instances 100 --episodes 10 --schedulers corrective,condition"
 )
 
 
 def add_to(app: typer.Typer) -> None:
     """Register this file's commands."""
-    app.command(epilog=f"Example: marl-sched evaluate {_SELECTORS} --view local --reach 1 --json results.json")(
-        takes(Selection)(evaluate)
-    )
-    app.command(epilog=f"Example: marl-sched compare {_SELECTORS} --out out/compare")(takes(Selection)(compare))
-    app.command(epilog="Example: marl-sched bench --env airme --json bench.json")(bench)
+    example = f"Example: marl-sched evaluate {_SELECTORS} --view local --reach 1 --json results.json"
+    app.command(epilog=example, context_settings=DOMAIN_OPTIONS)(takes(Selection)(evaluate))
+    example = f"Example: marl-sched compare {_SELECTORS} --out out/compare"
+    app.command(epilog=example, context_settings=DOMAIN_OPTIONS)(takes(Selection)(compare))
+    app.command(epilog=f"Example: marl-sched bench --env {options.DEFAULT_ENV} --json bench.json")(bench)
 
 
 def evaluate(selection: Selection, *, json: options.JsonFile = None) -> None:
@@ -48,13 +48,15 @@ def compare(
 ) -> None:
     """As evaluate, and draw the scores, an episode of every scheduler and the learning curves of training logs."""
     from marl_sched.cli.tables import print_scores
+    from marl_sched.domain import get_domain
     from marl_sched.files import write_json
     from marl_sched.train.evaluation.compare import draw_learning_curves, draw_scores, draw_timelines, play_episode
 
     options.check_folder(out)
     options.check_output(json)
     if log:  # first, as a log may be malformed
-        typer.echo(draw_learning_curves(out / "learning.png", log))
+        better = get_domain(selection.env).better
+        typer.echo(draw_learning_curves(out / "learning.png", log, better=better))
     resolved = selection.resolve()
     results = play(resolved, selection.baseline)
     for path in (out / "results.json", json):
@@ -63,16 +65,13 @@ def compare(
     print_scores(results)
     typer.echo(out / "results.json")
     typer.echo(draw_scores(out / "scores.png", results))
-    domain, settings = resolved.domain, resolved.settings.filled_in(resolved.domain)
-    episodes = {
-        name: play_episode(domain, scheduler, resolved.instances[0], settings)
-        for name, scheduler in resolved.schedulers.items()
-    }
-    typer.echo(draw_timelines(out / "timelines.png", domain, episodes, str(settings.objective)))
+    problem = resolved.problem
+    episodes = {name: play_episode(problem, scheduler) for name, scheduler in resolved.schedulers.items()}
+    typer.echo(draw_timelines(out / "timelines.png", problem.domain, episodes, problem.objective))
 
 
 def play(resolved: Resolved, baseline: str | None) -> dict[str, Any]:
-    """Evaluate what was selected, with a progress bar on stderr where there is a terminal; schema 1."""
+    """Evaluate what was selected, with a progress bar on stderr where there is a terminal; schema 2."""
     from rich.console import Console
     from rich.progress import Progress
 
@@ -81,7 +80,7 @@ def play(resolved: Resolved, baseline: str | None) -> dict[str, Any]:
     from marl_sched.train.malloc import keep_freed_memory
 
     keep_freed_memory()
-    domain = resolved.domain
+    domain = resolved.problem.domain
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         tasks: dict[str, Any] = {}
@@ -92,10 +91,8 @@ def play(resolved: Resolved, baseline: str | None) -> dict[str, Any]:
             progress.update(tasks[name], completed=done)
 
         table = evaluate(
-            domain,
+            resolved.problem,
             resolved.schedulers,
-            resolved.instances,
-            resolved.settings,
             reference=create_scheduler(domain.reference, domain) if domain.reference else None,
             baseline=baseline,
             progress=tell,
@@ -104,7 +101,7 @@ def play(resolved: Resolved, baseline: str | None) -> dict[str, Any]:
 
 
 def bench(
-    env: options.Env = "airme",
+    env: options.Env = options.DEFAULT_ENV,
     json: options.JsonFile = None,
     repeats: Annotated[int, typer.Option("--repeats", min=1, help="Measurements; the best is reported.")] = 5,
 ) -> None:

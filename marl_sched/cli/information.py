@@ -6,9 +6,12 @@ import os
 import platform
 from dataclasses import fields
 from importlib.metadata import PackageNotFoundError, version
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
+
+if TYPE_CHECKING:
+    from marl_sched.domain import Domain
 
 # What `doctor` looks for: distribution -> the extra that brings it, "" for what every installation has.
 DISTRIBUTIONS = {
@@ -49,6 +52,7 @@ def list_all() -> None:
         typer.echo(f"  scales       {', '.join(domain.scales)}")
         typer.echo(f"  objectives   {', '.join(domain.objectives)}")
         typer.echo(f"  views        {', '.join(_view(*item) for item in domain.views.items())}")
+        typer.echo(f"  options      {', '.join([f'{domain.unit}={domain.default_horizon}', *_options(domain)])}")
         typer.echo(f"  schedulers   {', '.join(rules(name)) or 'none'}")
         policies = {policy: card for policy, card in shipped_policies().items() if card.domain == name}
         typer.echo(f"  policies     {', '.join(policies) or 'none'}")
@@ -101,6 +105,11 @@ def _say_zenoh() -> None:
             typer.echo("zenoh          a session opens and listens on 127.0.0.1")
     except zenoh.ZError as error:
         typer.echo(f"zenoh          no session can be opened: {error}")
+
+
+def _options(domain: Domain) -> list[str]:
+    """The simulator's options with their defaults, as they are typed."""
+    return [f"{name.replace('_', '-')}={default}" for name, default in domain.simulator_options.items()]
 
 
 def _view(name: str, kind: type) -> str:

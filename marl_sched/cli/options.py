@@ -1,4 +1,4 @@
-"""Options that several commands share, and how they become views and instances."""
+"""Options that several commands share, and how they become a problem."""
 
 from __future__ import annotations
 
@@ -9,68 +9,108 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from marl_sched.errors import InvalidFileError, InvalidOptionError
+from marl_sched.cli.grouped import OwnOptions
+from marl_sched.envs import DOMAINS
+from marl_sched.errors import InvalidFileError, InvalidOptionError, UnknownNameError
 
 if TYPE_CHECKING:
     from marl_sched.agents.policies.cards import PolicyCard
     from marl_sched.domain import Domain
+    from marl_sched.problem import Problem
 
-Env = Annotated[str, typer.Option("--env", help="The environment; `marl-sched list` shows all.")]
-Scale = Annotated[str, typer.Option("--scale", help="Size of generated instances.")]
+DEFAULT_ENV = next(iter(DOMAINS))
+
+Env = Annotated[str, typer.Option("--env", help="The environment; `marl-sched list` shows all and their options.")]
+Scale = Annotated[
+    str | None, typer.Option("--scale", help="Size of generated instances (default: the environment's smallest).")
+]
 Seed = Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="Seed of instances and noise.")]
-Hours = Annotated[int | None, typer.Option("--hours", min=1, help="airme: hours of an episode (default 720).")]
-View = Annotated[str, typer.Option("--view", help="What an acting agent sees: full, local or (airme) random.")]
-Reach = Annotated[
-    int | None, typer.Option("--reach", metavar="R", help="view local: sectors seen either side (default 1).")
+Objective = Annotated[
+    str | None, typer.Option("--objective", help="What M1 is the mean of (default: the environment's first).")
 ]
-Comm = Annotated[
-    float | None,
-    typer.Option("--comm", metavar="C", help="view local: how far agents hear (airme: crews either side, default 1)."),
+View = Annotated[
+    str, typer.Option("--view", help="What an acting agent sees; its own options are options too, as in --reach 1.")
 ]
-Staleness = Annotated[
-    int | None, typer.Option("--staleness", metavar="H", help="view local: age of others' data (default 0).")
-]
-Sensing = Annotated[
-    float | None, typer.Option("--sensing", metavar="D", help="murse, view local: how far agents see (default 4).")
+Instances = Annotated[
+    str, typer.Option("--instances", metavar="N|DIR", help="How many to generate, or a folder of instance files.")
 ]
 JsonFile = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the results here.")]
 
-VIEW_OPTIONS = ("reach", "comm", "staleness", "sensing")
-# Options that only some environments have: `Domain.cli_options` says which. Given to another one they are errors.
-SIMULATOR_OPTIONS = ("hours", "rounds", "failure", "scheme", "mode", "durations", "proximity", "picking")
 
+def state_problem(
+    env: str,
+    own: OwnOptions,
+    *,
+    instances: str | Path | None = None,
+    scale: str | None = None,
+    view: str = "full",
+    **arguments: Any,
+) -> Problem:
+    """The problem that words of the command line state.
 
-def build_view(domain: Domain, kind: str, options: Mapping[str, Any]) -> Any:
-    """The domain's view of that kind with the options that are not None; raises as `Domain.view`."""
-    return domain.view(kind, **_given(options))
-
-
-def simulator_options(domain: Domain, options: Mapping[str, Any]) -> dict[str, Any]:
-    """The simulator's arguments for the options that were given; InvalidOptionError for another domain's option."""
-    given = _given(options)
-    for name in given:
-        if name not in domain.cli_options:
-            raise InvalidOptionError(f"--{name}: the environment {domain.name!r} has no such option")
-    return {domain.cli_options[name]: value for name, value in given.items()}
-
-
-def load_instances(domain: Domain, source: str, scale: str, seed: int) -> tuple[list[Any], str | None]:
-    """Instances and the scale that pads them: N generated ones of a scale, or all JSON files of a folder.
-
-    A user's own instances are of no scale (None). Raises InvalidOptionError or InvalidFileError.
+    `instances` is how many to generate, a folder of instance files (*.json) or one file; None: one is generated.
+    `own` holds the options that only this environment or this view has: the horizon by the name of its unit
+    (`--hours 48`), the view's options, and the simulator's. Raises UnknownNameError for an option that nobody has.
     """
-    domain.require_scale(scale)
-    if source.lstrip("-").isdigit():
-        if int(source) < 1:
-            raise InvalidOptionError(f"--instances: expected at least 1, got {source}")
-        return domain.instances(scale, int(source), seed), scale
-    folder = Path(source)
+    from marl_sched.domain import get_domain
+    from marl_sched.problem import Problem
+
+    domain = get_domain(env)
+    view_words: dict[str, Any] = {"kind": view}
+    horizon, options = None, {}
+    of_view = domain.view_options(view)
+    for option, text in own.words.items():
+        name = option.replace("-", "_")
+        if option == domain.unit:
+            horizon = _as_horizon(option, text)
+        elif name in of_view:
+            view_words[name] = as_value(text)
+        elif name in domain.simulator_options:
+            options[name] = as_value(text)
+        else:
+            known = [domain.unit, *of_view, *domain.simulator_options]
+            names = [f"--{one.replace('_', '-')}" for one in known]
+            raise UnknownNameError(f"option of {env} with view {view}", f"--{option}", [*names, *own.command])
+    source = _source(domain, instances, scale)
+    return Problem(domain, **source, horizon=horizon, view=view_words, options=options, **arguments)
+
+
+def _as_horizon(option: str, text: str) -> int:
+    value = as_value(text)
+    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+        raise InvalidOptionError(f"--{option}: expected an integer >= 1, got {text}")
+    return value
+
+
+def as_value(text: str) -> Any:
+    """A word of the command line as an int, a float, true, false or null as JSON has them, else as it is."""
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return {"true": True, "false": False, "null": None}.get(text, text)
+
+
+def _source(domain: Domain, instances: str | Path | None, scale: str | None) -> dict[str, Any]:
+    """The problem's instances: so many of a scale, or files, which are of no scale."""
+    if scale is not None:
+        domain.require_scale(scale)
+    if instances is None:
+        return {"scale": scale, "count": 1}
+    if isinstance(instances, Path):
+        return {"instances": [instances]}
+    if instances.lstrip("-").isdigit():
+        if int(instances) < 1:
+            raise InvalidOptionError(f"--instances: expected at least 1, got {instances}")
+        return {"scale": scale, "count": int(instances)}
+    folder = Path(instances)
     if not folder.is_dir():
-        raise InvalidOptionError(f"--instances: expected a number or a folder of instance files, got {source!r}")
+        raise InvalidOptionError(f"--instances: expected a number or a folder of instance files, got {instances!r}")
     paths = sorted(folder.glob("*.json"))
     if not paths:
         raise InvalidFileError(folder, "", "at least one instance file (*.json)")
-    return [domain.load(path) for path in paths], None
+    return {"instances": paths}
 
 
 def warn_of_impossible(domain: Domain, instances: Mapping[str, Any]) -> None:
@@ -87,19 +127,15 @@ def tell_of_training(name: str, card: PolicyCard | None, view: Any, objective: s
     """
     if card is None:
         return
-    from marl_sched.train.evaluation.evaluate import view_as_json
+    from marl_sched.problem import view_as_json, view_in_words
 
     trained, now = card.view, view_as_json(view)
     if trained != now and trained["kind"] != "random":
-        typer.echo(f"note: {name} was trained for view {_words(trained)}, it plays with {_words(now)}", err=True)
+        typer.echo(
+            f"note: {name} was trained for view {view_in_words(trained)}, it plays with {view_in_words(now)}", err=True
+        )
     if card.objective != objective:
         typer.echo(f"note: {name} was trained for {card.objective}, it plays for {objective}", err=True)
-
-
-def _words(view: Mapping[str, Any]) -> str:
-    """`local (reach 1, comm 1, staleness 0)`."""
-    details = ", ".join(f"{name} {value}" for name, value in view.items() if name != "kind")
-    return f"{view['kind']} ({details})" if details else str(view["kind"])
 
 
 def check_output(path: Path | None, option: str = "--json") -> None:
@@ -118,7 +154,3 @@ def check_folder(path: Path, option: str = "--out") -> None:
         raise InvalidOptionError(f"{option}: {there} is not a folder")
     if not os.access(there, os.W_OK):
         raise InvalidOptionError(f"{option}: no permission to write in {there}")
-
-
-def _given(options: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in options.items() if value is not None}

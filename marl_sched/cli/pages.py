@@ -20,11 +20,11 @@ UNTRAINED = 3  # exit code when the page is made, but lacks policies
 
 def add_to(app: typer.Typer) -> None:
     """Register this file's commands."""
-    app.command(epilog="Example: marl-sched tables --env airme --quick --workers 2")(tables)
+    app.command(epilog=f"Example: marl-sched tables --env {options.DEFAULT_ENV} --quick --workers 2")(tables)
 
 
 def tables(
-    env: options.Env = "airme",
+    env: options.Env = options.DEFAULT_ENV,
     quick: Annotated[bool, typer.Option("--quick", help="Few instances and episodes, in a folder of its own.")] = False,
     render: Annotated[bool, typer.Option("--render", help="Only draw the page; play nothing.")] = False,
     without_policies: Annotated[

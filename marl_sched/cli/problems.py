@@ -17,24 +17,27 @@ if TYPE_CHECKING:
 
 def add_to(app: typer.Typer) -> None:
     """Register this file's commands."""
-    app.command(epilog="Example: marl-sched generate airme --scale small --count 20 --seed 1 --out problems")(generate)
+    app.command(epilog=f"Example: marl-sched generate {options.DEFAULT_ENV} --count 20 --seed 1 --out problems")(
+        generate
+    )
 
 
 def generate(
     env: Annotated[str, typer.Argument(help="The environment.")],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write to.")],
-    scale: options.Scale = "small",
+    scale: options.Scale = None,
     count: Annotated[int, typer.Option("--count", min=1, help="How many instances.")] = 1,
     seed: options.Seed = 0,
     feasible: Annotated[
-        bool, typer.Option("--feasible", help="murse: draw until the exact solver finds a feasible schedule.")
+        bool,
+        typer.Option("--feasible", help="Draw until a solver finds a feasible schedule."),
     ] = False,
 ) -> None:
     """Draw problem instances and write each to a JSON file of its own."""
     from marl_sched.domain import get_domain
 
     domain = _solvable(get_domain(env)) if feasible else get_domain(env)
-    domain.require_scale(scale)
+    scale = domain.require_scale(scale or next(iter(domain.scales)))
     options.check_folder(out)
     digits = len(str(count - 1))
     for i, instance in enumerate(domain.instances(scale, count, seed)):

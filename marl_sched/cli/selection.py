@@ -2,40 +2,40 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Any
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from marl_sched.cli import options
+from marl_sched.cli.grouped import OwnOptions
 from marl_sched.errors import InvalidOptionError
 
 if TYPE_CHECKING:
     from marl_sched.agents.base import Scheduler
     from marl_sched.domain import Domain
-    from marl_sched.train.evaluation.evaluate import Settings
+    from marl_sched.problem import Problem
 
 
 @dataclass(frozen=True, kw_only=True)
 class Selection:
-    """The selectors as they were typed; each field is an option of the command line."""
+    """The selectors as they were typed; each field but `own` is an option of the command line."""
 
     schedulers: Annotated[
         str,
         typer.Option("--schedulers", metavar="A,B,C", help="Rules and shipped policies by name, checkpoints by path."),
-    ]
-    env: options.Env = "airme"
-    scale: options.Scale = "small"
-    instances: Annotated[
-        str,
-        typer.Option("--instances", metavar="N|DIR", help="How many to generate, or a folder of instance files."),
-    ] = "100"
+    ] = ""
+    scheduler: Annotated[
+        list[str] | None,
+        typer.Option("--scheduler", metavar="NAME", help="One more, also package.module:factory; may be repeated."),
+    ] = None
+    env: options.Env = options.DEFAULT_ENV
+    scale: options.Scale = None
+    instances: options.Instances = "100"
     episodes: Annotated[int, typer.Option("--episodes", min=1, help="Episodes of each instance.")] = 10
     seed: options.Seed = 0
-    hours: options.Hours = None
-    objective: Annotated[
-        str | None, typer.Option("--objective", help="What M1 is the mean of (default: the environment's first).")
-    ] = None
+    objective: options.Objective = None
     baseline: Annotated[
         str | None,
         typer.Option(
@@ -45,58 +45,44 @@ class Selection:
         ),
     ] = None
     view: options.View = "full"
-    reach: options.Reach = None
-    comm: options.Comm = None
-    staleness: options.Staleness = None
-    sensing: options.Sensing = None
-    failure: Annotated[str | None, typer.Option("--failure", help="airme: density as published, or hazard.")] = None
-    scheme: Annotated[str | None, typer.Option("--scheme", help="airme: full, skip or single.")] = None
-    rounds: Annotated[int | None, typer.Option("--rounds", min=1, help="murse: rounds of an episode.")] = None
-    mode: Annotated[str | None, typer.Option("--mode", help="murse: plan or online.")] = None
-    durations: Annotated[str | None, typer.Option("--durations", help="murse: deterministic or stochastic.")] = None
-    proximity: Annotated[str | None, typer.Option("--proximity", help="murse: distance, location or none.")] = None
-    picking: Annotated[str | None, typer.Option("--picking", help="murse: which free agent decides first.")] = None
+    own: OwnOptions
 
     def resolve(self) -> Resolved:
         """The objects that the words stand for, or an error that says which word is wrong."""
         from marl_sched.domain import get_domain
-        from marl_sched.train.evaluation.evaluate import Settings
 
-        domain = get_domain(self.env)
-        words = asdict(self)
-        own = options.simulator_options(domain, {name: words[name] for name in options.SIMULATOR_OPTIONS})
-        settings = Settings(
+        names = [*self.schedulers.split(","), *(self.scheduler or [])]
+        schedulers = create_schedulers(get_domain(self.env), names)
+        problem = options.state_problem(
+            self.env,
+            self.own,
+            instances=self.instances,
+            scale=self.scale,
+            view=self.view,
             episodes=self.episodes,
             seed=self.seed,
-            objective=domain.require_objective(self.objective) if self.objective else None,
-            horizon=own.pop("horizon", None),
-            view=options.build_view(domain, self.view, {name: words[name] for name in options.VIEW_OPTIONS}),
-            options=own,
+            objective=self.objective,
         )
-        schedulers = create_schedulers(domain, self.schedulers)
-        objective = str(settings.filled_in(domain).objective)
         for name, scheduler in schedulers.items():
-            options.tell_of_training(name, getattr(scheduler, "card", None), settings.view, objective)
-        instances, scale = options.load_instances(domain, self.instances, self.scale, self.seed)
-        options.warn_of_impossible(domain, {f"instance {i}": instance for i, instance in enumerate(instances)})
-        return Resolved(domain, schedulers, instances, replace(settings, scale=scale))
+            options.tell_of_training(name, getattr(scheduler, "card", None), problem.view, problem.objective)
+        captions = {f"instance {i}": instance for i, instance in enumerate(problem.instances)}
+        options.warn_of_impossible(problem.domain, captions)
+        return Resolved(problem, schedulers)
 
 
 @dataclass(frozen=True)
 class Resolved:
     """A selection as objects."""
 
-    domain: Domain
+    problem: Problem
     schedulers: dict[str, Scheduler]
-    instances: list[Any]
-    settings: Settings
 
 
-def create_schedulers(domain: Domain, names: str) -> dict[str, Scheduler]:
-    """The schedulers of a comma-separated list, by the names that were typed, in their order."""
+def create_schedulers(domain: Domain, names: Iterable[str]) -> dict[str, Scheduler]:
+    """The schedulers by the names that were typed, in their order; InvalidOptionError if there is none."""
     from marl_sched.agents.registry import create_scheduler
 
-    typed = [name.strip() for name in names.split(",") if name.strip()]
+    typed = [name.strip() for name in names if name.strip()]
     if not typed:
         raise InvalidOptionError("--schedulers: expected at least one name")
     return {name: create_scheduler(name, domain) for name in typed}

@@ -53,8 +53,7 @@ def _title(results: dict[str, Any]) -> str:
 
 def horizon(results: dict[str, Any]) -> str:
     """What an episode lasts: `720 hours`."""
-    unit = "hours" if "hours" in results else "rounds"
-    return f"{results[unit]} {unit}"
+    return f"{results['horizon']} {results['unit']}"
 
 
 def _caption(results: dict[str, Any]) -> str:

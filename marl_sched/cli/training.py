@@ -15,9 +15,9 @@ EXPORT_SEED = 90_002  # of instances that neither training nor validation draws
 
 def add_to(app: typer.Typer) -> None:
     """Register this file's commands."""
-    app.command(epilog="Example: marl-sched train env=airme view=local view.reach=1 algorithm=gae seed=1")(train)
-    app.command(epilog="Example: marl-sched resume runs/airme-local")(resume)
-    app.command(epilog="Example: marl-sched export runs/airme-local airme-local-profit --out policies")(export)
+    app.command(epilog="Example: marl-sched train view=local view.reach=1 algorithm=gae seed=1")(train)
+    app.command(epilog="Example: marl-sched resume runs/mine")(resume)
+    app.command(epilog="Example: marl-sched export runs/mine my-policy --out policies")(export)
     app.command(epilog="Example: marl-sched curves runs/gae-0 runs/gae-1 runs/ippo-0 --out curves.png")(curves)
 
 
@@ -69,7 +69,7 @@ def export(
 def curves(
     runs: Annotated[list[Path], typer.Argument(metavar="RUN_DIR...", help="Folders of runs.")],
     out: Annotated[Path, typer.Option("--out", metavar="PNG", help="The picture; its numbers go beside it, as JSON.")],
-    x: Annotated[str, typer.Option("--x", help="updates, hours (simulated) or seconds.")] = "updates",
+    x: Annotated[str, typer.Option("--x", help="updates, time (simulated) or seconds.")] = "updates",
     measure: Annotated[
         str, typer.Option("--measure", help="reward_rate (M1 sampled in training) or validation.")
     ] = "reward_rate",

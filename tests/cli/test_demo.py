@@ -1,6 +1,7 @@
 """The demonstration, with a rule in the place of the shipped policy where that saves time."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -9,35 +10,33 @@ from marl_sched.cli import demo
 from marl_sched.domain import get_domain
 from marl_sched.errors import DeploymentError
 from marl_sched.train.evaluation.compare import play_episode
-from marl_sched.train.evaluation.evaluate import Settings
+
+AIRME = get_domain("airme")
 
 
 def test_the_demo_has_seven_crews():
-    assert get_domain(demo.ENV).instances(demo.SCALE, 1, demo.SEED)[0].n_crews == 7
+    assert demo.deployed_problem(AIRME, "condition").instances[0].n_crews == 7
 
 
 def test_a_rule_plays_the_demo_with_the_local_view_as_it_comes():
-    domain = get_domain(demo.ENV)
-    assert demo._view_of(domain, "condition") == domain.views["local"]()
+    assert demo.deployed_problem(AIRME, "condition").view == AIRME.views["local"]()
 
 
 @pytest.mark.parametrize("change", [lambda series: series[:-1], lambda series: [*series[:5], -1.0, *series[6:]]])
-def test_a_deployed_month_that_differs_from_the_one_in_one_process_is_an_error(change):
-    domain = get_domain(demo.ENV)
-    replay = play_episode(
-        domain, RULES["condition"](), domain.instances(demo.SCALE, 1, demo.SEED)[0], Settings(horizon=12, scale="small")
-    )
-    series = domain.telemetry.series(replay)[demo.OBJECTIVE]
-    demo._require_equal(series, domain, replay)
+def test_a_deployed_episode_that_differs_from_the_one_in_one_process_is_an_error(change):
+    problem = demo.deployed_problem(AIRME, "condition").but(horizon=12)
+    replay = play_episode(problem, RULES["condition"]())
+    series = AIRME.telemetry.series(replay)[problem.objective]
+    demo.require_equal(series, problem, replay)
     different = change(series)
-    with pytest.raises(DeploymentError, match=f"hour {11 if len(different) < 12 else 5}$"):
-        demo._require_equal(different, domain, replay)
+    with pytest.raises(DeploymentError, match=rf"time {11 if len(different) < 12 else 5} \(hours\)$"):
+        demo.require_equal(different, problem, replay)
 
 
 @pytest.mark.slow
 def test_the_demo_deploys_compares_and_draws(run, tmp_path, monkeypatch):
-    monkeypatch.setattr(demo, "INSTANCES", 2)
-    monkeypatch.setattr(demo, "HOURS", 48)
+    short = replace(AIRME, demo=replace(AIRME.demo, instances=2), default_horizon=48)
+    monkeypatch.setattr("marl_sched.domain.get_domain", lambda name: short)
     ended = run("demo", "--policy", "preventive-first", "--out", tmp_path)
     assert ended.code == 0
     assert "the same to the last bit" in ended.out

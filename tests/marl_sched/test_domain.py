@@ -1,13 +1,11 @@
 """One rule makes views of what users write, whichever command, environment API or file it comes from."""
 
-import inspect
 import math
 
 import numpy as np
 import pytest
 
-from marl_sched.cli.options import SIMULATOR_OPTIONS
-from marl_sched.domain import domain_names, get_domain
+from marl_sched.domain import get_domain
 from marl_sched.envs.airme.views import FullView, LocalView
 from marl_sched.envs.murse.views import LocalView as MapView
 from marl_sched.errors import InvalidOptionError, UnknownNameError
@@ -58,10 +56,3 @@ def test_an_unknown_kind_names_the_known_ones():
 def test_what_describes_no_view_is_refused(given):
     with pytest.raises(InvalidOptionError, match="view: expected one of full, local, random or a view object"):
         AIRME.make_view(given)
-
-
-@pytest.mark.parametrize("name", domain_names())
-def test_options_of_the_command_line_stand_for_arguments_of_the_simulator(name):
-    domain = get_domain(name)
-    assert set(domain.cli_options) <= set(SIMULATOR_OPTIONS)
-    assert set(domain.cli_options.values()) <= set(inspect.signature(domain.simulator).parameters)

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -8,9 +7,9 @@ import pytest
 from marl_sched.agents.policies.cards import read_card
 from marl_sched.agents.policies.network_policy import NetworkPolicy
 from marl_sched.cli.app import run as run_command
-from marl_sched.domain import get_domain
 from marl_sched.envs.airme.views import LocalView
-from marl_sched.train.evaluation.evaluate import Settings, evaluate_scheduler
+from marl_sched.problem import Problem
+from marl_sched.train.evaluation.evaluate import evaluate_scheduler
 from marl_sched.train.export import export_policy
 from marl_sched.train.run import train_from_overrides
 
@@ -25,10 +24,9 @@ def test_the_card_holds_what_an_evaluation_with_that_seed_measures(tmp_path: Pat
     card = export_policy(
         run, tmp_path / "mine.safetensors", scales=["small"], instances=2, episodes=2, seed=5, length=20
     )
-    settings = Settings(episodes=2, seed=5, view=LocalView(), objective="profit", horizon=20, scale="small")
-    domain = get_domain("airme")
+    problem = Problem("airme", count=2, episodes=2, seed=5, view=LocalView(), objective="profit", horizon=20)
     policy = NetworkPolicy.load(tmp_path / "mine.safetensors")
-    scores = evaluate_scheduler(domain, policy, domain.instances("small", 2, 5), settings)
+    scores = evaluate_scheduler(problem, policy)
     assert card.scores["small"]["M1"] == pytest.approx(scores.measures["profit"].mean())
     assert card.scores["small"]["visible_share"] == pytest.approx(scores.visible_share)
     assert card.scores["validation"]["scale"] == "small"
@@ -40,12 +38,10 @@ def test_a_policy_is_measured_with_the_options_that_it_was_trained_with(tmp_path
     single = [*TINY, "+env.options.scheme=single"]
     run = train_from_overrides([*single, f"run_dir={tmp_path / 'run'}"], quiet=True)
     card = export_policy(run, tmp_path / "mine.safetensors", scales=["small"], instances=2, episodes=2, seed=5)
-    settings = Settings(episodes=2, seed=5, view=LocalView(), scale="small", options={"scheme": "single"})
-    domain = get_domain("airme")
+    problem = Problem("airme", count=2, episodes=2, seed=5, view=LocalView(), options={"scheme": "single"})
     policy = NetworkPolicy.load(tmp_path / "mine.safetensors")
     one, full = (
-        evaluate_scheduler(domain, policy, domain.instances("small", 2, 5), played).measures["profit"].mean()
-        for played in (settings, replace(settings, options={}))
+        evaluate_scheduler(played, policy).measures["profit"].mean() for played in (problem, problem.but(options={}))
     )
     assert one != pytest.approx(full)
     assert card.scores["small"]["M1"] == pytest.approx(one)

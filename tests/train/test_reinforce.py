@@ -17,10 +17,11 @@ from marl_sched.cli.app import run as run_command
 from marl_sched.domain import get_domain
 from marl_sched.envs.api.torchrl_env import SchedulingTorchRL
 from marl_sched.files import read_json, write_json
+from marl_sched.problem import Problem
 from marl_sched.train.algorithms.step_baseline import StepBaseline
 from marl_sched.train.collect import EpisodeCollector, InstanceSource
 from marl_sched.train.config import load_config
-from marl_sched.train.evaluation.evaluate import Settings, evaluate_scheduler
+from marl_sched.train.evaluation.evaluate import evaluate_scheduler
 from marl_sched.train.learner import PolicyGradient
 from marl_sched.train.ppo import Ppo, Sampler
 from marl_sched.train.run import resume, train_from_overrides
@@ -141,10 +142,8 @@ def test_a_policy_is_played_as_it_was_validated(tmp_path: Path):
     assert read_card(directory / "policy.json").mode == "sample"
     assert load_policy(path).mode == "sample"
     assert load_policy(path, mode="greedy").mode == "greedy"
-    domain, validation = get_domain("airme"), load_config(overrides).validation
-    settings = Settings(episodes=1, seed=validation.seed, horizon=20, scale="small")
-    instances = domain.instances("small", 2, validation.seed)
-    scores = evaluate_scheduler(domain, load_policy(path), instances, settings).measures["profit"]
+    problem = Problem("airme", count=2, episodes=1, seed=load_config(overrides).validation.seed, horizon=20)
+    scores = evaluate_scheduler(problem, load_policy(path)).measures["profit"]
     assert read_card(directory / "policy.json").scores["validation"]["M1"] == pytest.approx(scores.mean())
-    greedy = evaluate_scheduler(domain, load_policy(path, mode="greedy"), instances, settings).measures["profit"]
+    greedy = evaluate_scheduler(problem, load_policy(path, mode="greedy")).measures["profit"]
     assert greedy.mean() != pytest.approx(scores.mean())

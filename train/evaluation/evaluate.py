@@ -6,86 +6,35 @@ of the objective, M2 its gain in percent over the domain's reference scheduler o
 reference always plays with the full view, as published; paired differences are taken to it unless another
 baseline is named, which is then one of the table's schedulers under the table's view.
 
-    table = evaluate(domain, {"corrective": scheduler}, instances, Settings(episodes=10, seed=1))
+    table = evaluate(Problem("airme", count=20, seed=1), {"corrective": scheduler})
     write_json(path, table.as_json())
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from itertools import count
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from marl_sched.agents.base import Scheduler
-from marl_sched.domain import Domain
+from marl_sched.agents.playing import play
 from marl_sched.errors import InvalidOptionError, require
 from marl_sched.graph import VISIBLE_SHARE
+from marl_sched.problem import Problem, view_as_json
 from marl_sched.simulation import TurnSimulator
 from marl_sched.statistics import Summary, paired_difference, percent_gain, summarise
 
-SCHEMA = 1
+SCHEMA = 2  # 1 named the horizon by its unit, as `hours`
 EXACT = "exact"  # the scheduler that the others' gap is taken to where it plays
 SHARE_EVERY = 8  # turns between two readings of the visible share
-EPOCHS_AT_ONCE = 24  # between two reports of progress, where a scheduler plays decision epochs in compiled code
 LOCAL_SHARE = 0.45  # a view that shows more of the graph than this is not called local
 _CHUNK_CELLS = 2048 * 41 * 16  # pairs of action and agent in flight: 2048 rows of a small AirME fleet, 288 of a large
 
 Progress = Callable[[float], None]
 """Told the share of the work that is done, in [0, 1]."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Settings:
-    """What all schedulers of a table have in common.
-
-    Attributes:
-        episodes: episodes of each instance.
-        seed: of the noise.
-        view: an instance of one of the domain's views; None is the full one.
-        objective: what M1 is the mean of; None is the domain's default.
-        horizon: simulated time of an episode; None is the domain's default.
-        scale: name of the scale that the instances are drawn from; it sets the padding. None: they are a
-            user's own, the padding is that of the largest.
-        options: more options of the domain's simulator.
-    """
-
-    episodes: int = 10
-    seed: int = 0
-    view: Any = None
-    objective: str | None = None
-    horizon: int | None = None
-    scale: str | None = None
-    options: Mapping[str, Any] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        """Refuse settings under which there is nothing to evaluate."""
-        if self.episodes < 1:
-            raise InvalidOptionError(f"episodes: expected an integer >= 1, got {self.episodes}")
-
-    def simulator(self, domain: Domain, instances: Sequence[Any], **changes: Any) -> TurnSimulator:
-        """The domain's simulator with these settings; `changes` go before them."""
-        filled = self.filled_in(domain)
-        options = {
-            "view": filled.view,
-            "objective": filled.objective,
-            "horizon": filled.horizon,
-            "seed": filled.seed,
-            "pad": filled.scale,
-            **filled.options,
-        }
-        return domain.simulator(instances, **{**options, **changes})
-
-    def filled_in(self, domain: Domain) -> Settings:
-        """These settings with the domain's defaults for objective and horizon."""
-        return replace(
-            self,
-            objective=domain.objectives[0] if self.objective is None else self.objective,
-            horizon=domain.default_horizon if self.horizon is None else self.horizon,
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,61 +57,70 @@ class Scores:
 
 
 def evaluate_scheduler(
-    domain: Domain,
+    problem: Problem,
     scheduler: Scheduler,
-    instances: Sequence[Any],
-    settings: Settings,
     *,
     max_rows: int | None = None,
     progress: Progress | None = None,
 ) -> Scores:
-    """Play `settings.episodes` episodes of every instance, many in lock-step, at most `max_rows` at a time.
+    """Play the problem's episodes of every instance, many in lock-step, at most `max_rows` at a time.
 
-    Rows never influence each other, so neither `max_rows` (default: as many as keep memory small) nor the
+    Envs never influence each other, so neither `max_rows` (default: as many as keep memory small) nor the
     order of the instances changes a rule's scores; a network's logits differ in the last digits.
     """
-    if not instances:
-        raise InvalidOptionError("instances: expected at least one")
     started = time.perf_counter()
-    total = len(instances) * settings.episodes
+    total = problem.count * problem.episodes
     measures: list[dict[str, np.ndarray]] = []
     per_round: list[dict[str, np.ndarray]] = []
-    shares, turns = 0.0, 0
-    for rows in _chunks(total, max_rows or _rows_that_fit(domain, instances, settings)):
-        chosen = [instances[row // settings.episodes] for row in rows]
-        simulator = settings.simulator(domain, chosen, **own_options(scheduler, settings))
-        simulator.reset(seed=settings.seed, episodes=[row % settings.episodes for row in rows])
-        scheduler.start(simulator, np.ones(simulator.batch, np.bool_))
-        player = scheduler.epoch_player(simulator)
-        while player is not None and (simulator.acting >= 0).any():
-            if progress is not None:
-                progress((rows.start + len(rows) * _played(simulator)) / total)
-            seen, decisions = player(EPOCHS_AT_ONCE)
-            shares, turns = shares + seen, turns + decisions
-        for turn in count():
-            acting = simulator.acting >= 0
-            if not acting.any():
-                break
-            if turn % SHARE_EVERY == 0:
-                shares += _visible_share(simulator)[acting].sum()
-                turns += int(acting.sum())
-                if progress is not None:
-                    progress((rows.start + len(rows) * _played(simulator)) / total)
-            simulator.step(scheduler.decide(simulator))
+    shares = _Shares(total, progress)
+    for rows in _chunks(total, max_rows or _rows_that_fit(problem)):
+        simulator = problem.simulator([row // problem.episodes for row in rows], **own_options(scheduler, problem))
+        simulator.reset(seed=problem.seed, episodes=[row % problem.episodes for row in rows])
+        shares.start = rows.start
+        play(scheduler, simulator, shares)
         measures.append(simulator.objectives())
         per_round.append({**simulator.per_round(), **scheduler.per_round()})
     return Scores(
-        measures=_joined(measures, len(instances)),
-        per_round=_joined(per_round, len(instances)),
-        visible_share=float(shares / turns),
+        measures=_joined(measures, problem.count),
+        per_round=_joined(per_round, problem.count),
+        visible_share=shares.mean,
         seconds=time.perf_counter() - started,
         needs=str(scheduler.privileged_info),
     )
 
 
-def own_options(scheduler: Scheduler, settings: Settings) -> dict[str, Any]:
-    """The simulator's options that belong to a scheduler, where the settings do not choose others."""
-    return {name: value for name, value in scheduler.simulator_options.items() if name not in settings.options}
+def own_options(scheduler: Scheduler, problem: Problem) -> dict[str, Any]:
+    """The simulator's options that belong to a scheduler, where the problem does not choose others."""
+    return {name: value for name, value in scheduler.simulator_options.items() if name not in problem.options}
+
+
+class _Shares:
+    """Watches episodes: reads the visible share at every few decisions, and tells how far they are."""
+
+    def __init__(self, total: int, progress: Progress | None) -> None:
+        self.start, self._total, self._progress = 0, total, progress
+        self._sum, self._turns = 0.0, 0
+
+    def before(self, simulator: TurnSimulator, number: int) -> None:
+        """Read the shares of the acting agents at every few decisions."""
+        if number % SHARE_EVERY:
+            return
+        acting = simulator.acting >= 0
+        # in float64 sums of these float32 are exact, so that the order of the envs does not matter
+        shares = simulator.observe(simulator.acting)[VISIBLE_SHARE].astype(np.float64)
+        self.played(simulator, float(shares[acting].sum()), int(acting.sum()))
+
+    def played(self, simulator: TurnSimulator, shares: float, decisions: int) -> None:
+        """Take over the sum of the shares that so many decisions were made on."""
+        self._sum, self._turns = self._sum + shares, self._turns + decisions
+        if self._progress is not None:
+            played = float(simulator.progress_share.mean())
+            self._progress((self.start + simulator.batch * played) / self._total)
+
+    @property
+    def mean(self) -> float:
+        """Mean over the decisions read."""
+        return float(self._sum / self._turns)
 
 
 def _joined(parts: list[dict[str, np.ndarray]], n_instances: int) -> dict[str, np.ndarray]:
@@ -171,24 +129,14 @@ def _joined(parts: list[dict[str, np.ndarray]], n_instances: int) -> dict[str, n
     return {name: values.reshape(n_instances, -1, *values.shape[1:]) for name, values in whole.items()}
 
 
-def _visible_share(simulator: TurnSimulator) -> np.ndarray:
-    # in float64 sums of these float32 are exact, so that the order of the rows does not matter
-    return simulator.observe(simulator.acting)[VISIBLE_SHARE].astype(np.float64)
-
-
-def _played(simulator: TurnSimulator) -> float:
-    horizon = getattr(simulator, "horizon", None)
-    return float(np.where(simulator.over, 1.0, simulator.time / horizon if horizon else 0.0).mean())
-
-
 def _chunks(total: int, size: int) -> Iterator[range]:
     for start in range(0, total, size):
         yield range(start, min(start + size, total))
 
 
-def _rows_that_fit(domain: Domain, instances: Sequence[Any], settings: Settings) -> int:
-    # a scale sets the padding by itself; a user's own instances are padded to their largest
-    sizes = settings.simulator(domain, instances if settings.scale is None else instances[:1], view=None)
+def _rows_that_fit(problem: Problem) -> int:
+    # a scale sets the padding by itself; without one the largest instance does
+    sizes = problem.simulator(None if problem.pad is None else [0], view=None)
     return max(1, _CHUNK_CELLS // (sizes.max_actions * max(sizes.max_agents, 16)))
 
 
@@ -197,46 +145,43 @@ class Table:
     """Schedulers side by side: what every plot and every printed table is drawn from.
 
     Attributes:
-        domain: what was played.
-        settings: with objective and horizon filled in.
-        n_instances: number of instances.
+        problem: what was played.
         scores: name as the user typed it -> scores.
         reference: the name of what M2 is the gain over, and its scores under the full view; None where the
             domain has no reference scheduler.
         baseline: what paired differences are taken to: its name, the view it played with, its scores.
     """
 
-    domain: Domain
-    settings: Settings
-    n_instances: int
+    problem: Problem
     scores: Mapping[str, Scores]
     reference: tuple[str, Scores] | None
     baseline: tuple[str, Any, Scores]
 
     def as_json(self) -> dict[str, Any]:
-        """The table as schema 1 of `marl-sched evaluate --json`."""
-        settings = self.settings
+        """The table as schema 2 of `marl-sched evaluate --json`."""
+        problem = self.problem
         data: dict[str, Any] = {
             "schema": SCHEMA,
-            "env": self.domain.name,
-            "scale": settings.scale,
-            "objective": settings.objective,
-            "better": self.domain.better,
+            "env": problem.domain.name,
+            "scale": problem.pad,
+            "objective": problem.objective,
+            "better": problem.domain.better,
             "view": {
-                **view_as_json(settings.view),
+                **view_as_json(problem.view),
                 "visible_share": self.visible_share,
                 "local": self.visible_share <= LOCAL_SHARE,
             },
-            "instances": self.n_instances,
-            "episodes": settings.episodes,
-            self.domain.unit: settings.horizon,
-            "seed": settings.seed,
-            "options": dict(settings.options),
+            "instances": problem.count,
+            "episodes": problem.episodes,
+            "horizon": problem.horizon,
+            "unit": problem.unit,
+            "seed": problem.seed,
+            "options": dict(problem.options),
             "baseline": {"scheduler": self.baseline[0], "view": view_as_json(self.baseline[1])},
         }
         if self.reference is not None:
             name, scores = self.reference
-            m1 = self._summary(scores.measures[str(settings.objective)])
+            m1 = self._summary(scores.measures[problem.objective])
             data["reference"] = {"scheduler": name, "view": {"kind": "full"}, "M1": m1.as_json()}
         data["schedulers"] = {name: self._row(scores) for name, scores in self.scores.items()}
         return data
@@ -247,12 +192,12 @@ class Table:
         return float(np.mean([scores.visible_share for scores in self.scores.values()]))
 
     def _row(self, scores: Scores) -> dict[str, Any]:
-        objective = str(self.settings.objective)
+        objective = self.problem.objective
         m1 = scores.measures[objective]
         row: dict[str, Any] = {"M1": self._summary(m1).as_json()}
         if self.reference is not None:
             gain = percent_gain(m1, self.reference[1].measures[objective])
-            row["M2"] = self._summary(gain).as_json()
+            row["M2"] = self._summary(-gain if self.problem.domain.better == "lower" else gain).as_json()
         for name, values in scores.measures.items():
             row[name] = row["M1"] if name == objective else self._summary(values).as_json()
         for name, values in scores.per_round.items():
@@ -270,14 +215,12 @@ class Table:
 
     def _summary(self, values: np.ndarray) -> Summary:
         # the same resamples for every row: intervals of equal scores are equal
-        return summarise(values, np.random.default_rng(self.settings.seed))
+        return summarise(values, np.random.default_rng(self.problem.seed))
 
 
 def evaluate(
-    domain: Domain,
+    problem: Problem,
     schedulers: Mapping[str, Scheduler],
-    instances: Sequence[Any],
-    settings: Settings,
     *,
     reference: Scheduler | None = None,
     baseline: str | None = None,
@@ -295,27 +238,24 @@ def evaluate(
         raise InvalidOptionError("schedulers: expected at least one")
     if baseline is not None:
         require("baseline", baseline, schedulers)
-    settings = settings.filled_in(domain)
 
-    def play(name: str, scheduler: Scheduler, settings: Settings) -> Scores:
+    def scores_of(name: str, scheduler: Scheduler, problem: Problem) -> Scores:
         report = None if progress is None else lambda done: progress(name, done)
-        return evaluate_scheduler(domain, scheduler, instances, settings, progress=report)
+        return evaluate_scheduler(problem, scheduler, progress=report)
 
-    scores = {name: play(name, scheduler, settings) for name, scheduler in schedulers.items()}
+    scores = {name: scores_of(name, scheduler, problem) for name, scheduler in schedulers.items()}
     held_against = None
     if reference is not None:
-        if reference.name in scores and view_as_json(settings.view)["kind"] == "full":
+        if reference.name in scores and view_as_json(problem.view)["kind"] == "full":
             under_full_view = scores[reference.name]
         else:
-            under_full_view = play(reference.name, reference, replace(settings, view=None))
+            under_full_view = scores_of(reference.name, reference, problem.but(view=None))
         held_against = (reference.name, under_full_view)
     return Table(
-        domain=domain,
-        settings=settings,
-        n_instances=len(instances),
+        problem=problem,
         scores=scores,
         reference=held_against,
-        baseline=_baseline(baseline, scores, settings.view, held_against),
+        baseline=_baseline(baseline, scores, problem.view, held_against),
     )
 
 
@@ -337,8 +277,3 @@ def _mean(values: np.ndarray) -> float | None:
 
 def _by_round(values: np.ndarray) -> list[float | None]:
     return [_mean(values[..., k]) for k in range(values.shape[-1])]
-
-
-def view_as_json(view: Any) -> dict[str, Any]:
-    """`{"kind": "local", "reach": 1, ...}`; None is the full view."""
-    return {"kind": "full"} if view is None else {"kind": view.kind, **asdict(view)}

@@ -31,7 +31,7 @@ def save(figure: Figure, path: Path) -> Path:
 
 
 def score_bars(*tables: Mapping[str, Any]) -> Figure:
-    """M1 of the schedulers of one or more evaluations (schema 1): interquartile mean with its interval, and mean.
+    """M1 of the schedulers of one or more evaluations (schema 2): interquartile mean with its interval, and mean.
 
     Tables differ in colour and are told apart by their views.
     """
@@ -54,8 +54,7 @@ def score_bars(*tables: Mapping[str, Any]) -> Figure:
         )
     axes.set_yticks(y, [name for name, _, _ in rows])
     axes.set_xlim(min(0.0, 1.05 * low.min()), 1.12 * right or 1.0)
-    unit = "hours" if "hours" in tables[0] else "rounds"
-    axes.set_xlabel(f"M1: mean {tables[0]['objective']} over {tables[0][unit]} {unit}")
+    axes.set_xlabel(f"M1: mean {tables[0]['objective']} over {tables[0]['horizon']} {tables[0]['unit']}")
     axes.set_title(_conditions(tables[0]), fontsize=10, loc="left")
     _plain(axes)
     axes.grid(axis="x", color=_FAINT, lw=0.6)
@@ -70,15 +69,16 @@ def score_bars(*tables: Mapping[str, Any]) -> Figure:
 def timelines(
     panels: Mapping[str, np.ndarray],
     *,
-    hours: int,
+    length: int,
+    unit: str,
     legend: Mapping[str, Sequence[int]] | None = None,
     band: tuple[str, int] | None = None,
     title: str = "",
 ) -> Figure:
     """One episode as several schedulers played it: a caption -> uint8 image (height, width, 3) for each panel.
 
-    `hours` is what the width of an image stands for. `legend` says what colours mean, `band` what a band of
-    that many pixels stands for; pictures that come with axes of their own have neither.
+    `length` is what the width of an image stands for, counted in `unit`. `legend` says what colours mean, `band`
+    what a band of that many pixels stands for; pictures that come with axes of their own have neither.
     """
     heights = [0.6 + image.shape[0] / 110 for image in panels.values()]
     figure = Figure(figsize=(10.0, 1.0 + sum(heights)), layout="constrained")
@@ -89,14 +89,14 @@ def timelines(
             axes.set_axis_off()
         else:
             count = image.shape[0] // band[1]
-            axes.imshow(image, aspect="auto", interpolation="nearest", extent=(0, hours, count + 0.5, 0.5))
+            axes.imshow(image, aspect="auto", interpolation="nearest", extent=(0, length, count + 0.5, 0.5))
             axes.set_ylabel(band[0])
             axes.set_yticks([1, *range(10, count + 1, 10)])
             _plain(axes)
         axes.set_title(caption, fontsize=10, loc="left")
     if band is not None:
-        all_axes[-1].set_xticks(range(0, hours + 1, 24 * max(1, round(hours / 24 / 15))))
-        all_axes[-1].set_xlabel("hour")
+        all_axes[-1].xaxis.set_major_locator(MaxNLocator(nbins=15, integer=True, steps=[1, 2, 2.4, 5, 6, 10]))
+        all_axes[-1].set_xlabel(unit)
     if title:
         figure.suptitle(title, fontsize=11, x=0.01, ha="left")
     if legend is not None:
@@ -105,14 +105,17 @@ def timelines(
     return figure
 
 
-def learning_curves(curves: Mapping[str, tuple[np.ndarray, np.ndarray]], *, measure: str = "M1") -> Figure:
-    """Scores over minutes of training: name -> (minutes float64 (N,), scores float64 (N,))."""
+def learning_curves(curves: Mapping[str, tuple[np.ndarray, np.ndarray]], *, better: str, measure: str = "M1") -> Figure:
+    """Scores over minutes of training: name -> (minutes float64 (N,), scores float64 (N,)); the best is labelled.
+
+    `better`: which score is, "higher" or "lower".
+    """
     figure = Figure(figsize=(8.0, 4.4), layout="constrained")
     axes = figure.add_subplot()
     for i, (name, (minutes, scores)) in enumerate(curves.items()):
         colour = _LINES[i % len(_LINES)]
         axes.plot(minutes, scores, "-", color=colour, lw=1.6, marker="o", ms=3, label=name)
-        best = int(np.argmax(scores))
+        best = int(np.argmin(scores) if better == "lower" else np.argmax(scores))
         axes.annotate(
             f"{scores[best]:.3f}",
             (minutes[best], scores[best]),
@@ -140,7 +143,9 @@ def curves_by_group(curves: Mapping[str, Any]) -> Figure:
             axes.plot(run["x"], run["y"], "-", color=colour, lw=0.9, alpha=0.45)
         runs = f"{len(group['runs'])} run{'s' if len(group['runs']) > 1 else ''}"
         axes.plot(group["mean"]["x"], group["mean"]["y"], "-", color=colour, lw=2.4, label=f"{name}, mean of {runs}")
-    axes.set_xlabel({"hours": "simulated hours", "seconds": "seconds of training"}.get(curves["x"], curves["x"]))
+    axes.set_xlabel(
+        {"time": f"simulated {curves['unit']}", "seconds": "seconds of training"}.get(curves["x"], curves["x"])
+    )
     how = "sampled, in training" if curves["measure"] == "reward_rate" else "on validation instances"
     smooth = f", mean of {curves['smooth']} points" if curves["smooth"] > 1 else ""
     axes.set_ylabel(f"M1 {how}{smooth}")

@@ -25,9 +25,10 @@ from msgspec import Struct
 from marl_sched.agents.policies.cards import read_card, source_revision
 from marl_sched.agents.registry import create_scheduler
 from marl_sched.domain import get_domain
-from marl_sched.errors import InvalidFileError
+from marl_sched.errors import InvalidFileError, InvalidOptionError
 from marl_sched.files import read_json, write_json
-from marl_sched.train.evaluation.evaluate import Settings, evaluate_scheduler
+from marl_sched.problem import Problem
+from marl_sched.train.evaluation.evaluate import evaluate_scheduler
 
 SCHEMA = 1
 DECIMALS = 6
@@ -118,11 +119,11 @@ class Job:
     @property
     def cost(self) -> float:
         """About how long it takes compared to other jobs: measured on a core, in thousandths of a second."""
-        inputs = self.inputs
-        size = 2.5 ** list(get_domain(inputs.env).scales).index(inputs.scale)  # planes double, crews double
+        inputs, domain = self.inputs, get_domain(self.inputs.env)
+        size = 2.5 ** list(domain.scales).index(inputs.scale)  # nodes double, agents double
         if isinstance(inputs, Bound):
-            return 5000.0 * inputs.price_vectors * inputs.evaluations * inputs.horizon / 720
-        rows = inputs.instances * inputs.episodes * inputs.horizon / 720
+            return 5000.0 * inputs.price_vectors * inputs.evaluations * inputs.horizon / domain.default_horizon
+        rows = inputs.instances * inputs.episodes * inputs.horizon / domain.default_horizon
         return rows * size * (10.0 if self.weights is None else 60.0)
 
 
@@ -193,13 +194,15 @@ def _play(inputs: Play, weights: Path | None, besides: Sequence[Play]) -> list[C
             raise InvalidFileError(weights, "", "the weights that were there when the cells were listed")
         card = read_card(weights.with_suffix(".json"))
         training = Training(command=card.command, seed=card.seed, view=card.view, knowledge=card.training_knowledge)
-    settings = Settings(
+    problem = Problem(
+        domain,
+        scale=inputs.scale,
+        count=inputs.instances,
         episodes=inputs.episodes,
         seed=inputs.seed,
-        view=domain.make_view(inputs.view),
+        view=inputs.view,
         objective=inputs.objective,
         horizon=inputs.horizon,
-        scale=inputs.scale,
         options=inputs.options,
     )
     scheduler = (
@@ -207,8 +210,7 @@ def _play(inputs: Play, weights: Path | None, besides: Sequence[Play]) -> list[C
         if weights is None
         else create_scheduler(weights, domain, mode=inputs.mode)
     )
-    problems = domain.instances(inputs.scale, inputs.instances, inputs.seed)
-    scores = evaluate_scheduler(domain, scheduler, problems, settings)
+    scores = evaluate_scheduler(problem, scheduler)
     revision = source_revision()
     return [
         Cell(
@@ -228,8 +230,11 @@ def _play(inputs: Play, weights: Path | None, besides: Sequence[Play]) -> list[C
 
 def _prove(inputs: Bound) -> Cell:
     started = time.perf_counter()
-    bounds = import_module(f"marl_sched.agents.{inputs.env}.bound.relaxation")
-    problems = get_domain(inputs.env).instances(inputs.scale, inputs.instances, inputs.seed)
+    domain = get_domain(inputs.env)
+    if domain.bound is None:
+        raise InvalidOptionError(f"env: no bound is known for the environment {inputs.env!r}")
+    bounds = import_module(domain.bound)
+    problems = domain.instances(inputs.scale, inputs.instances, inputs.seed)
     relaxation = bounds.Relaxation(problems, objective=inputs.objective, horizon=inputs.horizon)
     found = bounds.upper_bounds(relaxation, price_vectors=inputs.price_vectors, evaluations=inputs.evaluations)
     return Cell(

@@ -11,7 +11,7 @@ import msgspec
 
 from marl_sched.agents.policies.cards import Mode, read_card
 from marl_sched.agents.registry import SHIPPED, rules
-from marl_sched.train.evaluation.evaluate import view_as_json
+from marl_sched.problem import view_as_json
 from marl_sched.train.published.cells import Bound, Job, Play, digest, weights_sha256
 from marl_sched.train.published.plan import Line, Plan, Player, Row, Size
 

@@ -39,21 +39,21 @@ def page(results: Mapping[str, Any]) -> str:
 
 def _head(results: Mapping[str, Any]) -> Iterator[str]:
     yield f"# {results['env']}: the published tables, made again"
-    unit = "hours" if "hours" in results else "rounds"
     if results["quick"]:
         yield "**Quick look:** few instances and episodes, a loose bound. Figures to keep are made without `--quick`."
     bound = results["bound"]
     fewer = "; rows that say that they played fewer episodes are held against means over all, with wider intervals"
     yield (
         f"Made by `{results['command']}`: {results['instances']} instances of each scale x {results['episodes']} "
-        f"episodes of {results[unit]} {unit}, seed {results['seed']}, common random numbers for all. This page is "
-        "rendered from the cells beside it and says nothing that they do not."
+        f"episodes of {results['horizon']} {results['unit']}, seed {results['seed']}, "
+        "common random numbers for all. This page is rendered from the cells beside it and says nothing that they do "
+        "not."
     )
     yield (
-        "**M1** is the objective as a share of what a fleet that never stops flying would reach, **M2** the gain "
+        f"**M1** is {results['measure']}, **M2** the gain "
         f"in percent over {results['reference']} on the same instance; ± is the standard deviation over instances of "
-        "their means. *In italics*, below: what the dissertation published (tables 6.2 to 6.4), on other instances of "
-        "the same distribution. **Difference** is paired, to the best rule on that scale that does not know the "
+        f"their means. *In italics*, below: what the dissertation published ({results['source']}), on other "
+        "instances of the same distribution. **Difference** is paired, to the best rule on that scale that does not know the "
         f"failure model, with Student's 95 percent interval over instances{fewer if _some_fewer(results) else ''}. "
         "**IQM** is the interquartile mean of the instances with its bootstrap interval. **Way** is how much of the "
         f"distance from {results['reference']} to the upper bound a scheduler goes. The bound is proved for every "

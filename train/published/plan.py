@@ -100,7 +100,7 @@ class Decentralisation(_Part, frozen=True, kw_only=True):
 
 
 class Bounding(_Part, frozen=True, kw_only=True):
-    """How hard to look for the upper bound: see `marl_sched.agents.airme.bound.relaxation.upper_bounds`."""
+    """How hard to look for the upper bound: see `upper_bounds` of the domain's bound."""
 
     price_vectors: Count
     evaluations: Count
@@ -121,6 +121,8 @@ class Plan(_Part, frozen=True, kw_only=True):
         env: the domain's name.
         scales, objectives: the columns, and the tables.
         full, quick: two sizes; the quick one is for a look.
+        measure: what M1 is, in words.
+        source: where the published entries stand.
         seed: of instances and noise.
         horizon: simulated time of an episode; None is the domain's default.
         rows: schedulers in the order of the tables. The domain's reference scheduler has to be one of them.
@@ -130,6 +132,8 @@ class Plan(_Part, frozen=True, kw_only=True):
     env: str
     scales: Annotated[list[str], Meta(min_length=1)]
     objectives: Annotated[list[str], Meta(min_length=1)]
+    measure: str = "the mean of the objective"
+    source: str = ""
     full: Size
     quick: Size
     seed: Seed

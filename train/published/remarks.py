@@ -14,16 +14,17 @@ def reading_aid(table: Mapping[str, Any]) -> str:
 
 
 def _best(table: Mapping[str, Any]) -> str:
-    """Who has the highest mean on each scale, with and without the failure model."""
+    """Who has the best mean on each scale without the failure model."""
+    best, word = (min, "Lowest") if table["better"] == "lower" else (max, "Highest")
     told = []
     for scale in table["scales"]:
         entries = [(row, row["scales"][scale]) for row in table["rows"] if "M1" in row["scales"].get(scale, {})]
         blind = [pair for pair in entries if FAILURE_MODEL not in pair[1]["needs"]]
-        row, entry = max(blind, key=lambda pair: float(pair[1]["M1"]["mean"]))
+        row, entry = best(blind, key=lambda pair: float(pair[1]["M1"]["mean"]))
         told.append(
             f"{row['label']} on {scale} ({entry['M1']['mean']:.4f}, {entry['gap_closed']:.1f} % of the gap closed)"
         )
-    return f"Highest mean without the failure model: {_listed(told)}."
+    return f"{word} mean without the failure model: {_listed(told)}."
 
 
 def _learned(table: Mapping[str, Any]) -> str:
@@ -33,13 +34,14 @@ def _learned(table: Mapping[str, Any]) -> str:
         for row in table["rows"]
         if row["learned"]
     }
+    sign = -1 if table["better"] == "lower" else 1
     learned = {label: differences for label, differences in learned.items() if differences}
     if not learned:
         return "No learned scheduler has played yet."
     above = [
         label
         for label, differences in learned.items()
-        if all(difference["ci95"] is not None and difference["ci95"][0] > 0 for difference in differences)
+        if all(each["ci95"] is not None and min(sign * end for end in each["ci95"]) > 0 for each in differences)
     ]
     if not above:
         return "No learned scheduler passes the best rule with an interval above zero on every scale that it plays."
@@ -47,14 +49,23 @@ def _learned(table: Mapping[str, Any]) -> str:
 
 
 def _above_the_bound(table: Mapping[str, Any]) -> list[str]:
-    """Means that lie above the bound, which holds for expectations."""
+    """Means that pass the bound, which holds for expectations."""
+    lower = table["better"] == "lower"
     above = [
         f"{row['label']} on {scale} ({entry['M1']['mean']:.4f})"
         for row in table["rows"]
         for scale, entry in row["scales"].items()
-        if "M1" in entry and entry["M1"]["mean"] > table["scales"][scale]["bound"]["M1"]["mean"]
+        if "M1" in entry and _passes(entry["M1"]["mean"], table["scales"][scale]["bound"]["M1"]["mean"], lower)
     ]
-    return [f"Means above the bound, which binds expectations: {_listed(above)}."] if above else []
+    return (
+        [f"Means {'below' if lower else 'above'} the bound, which binds expectations: {_listed(above)}."]
+        if above
+        else []
+    )
+
+
+def _passes(mean: float, bound: float, lower: bool) -> bool:
+    return mean < bound if lower else mean > bound
 
 
 def _ranks(table: Mapping[str, Any]) -> str:

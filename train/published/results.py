@@ -20,7 +20,7 @@ from marl_sched.train.published.cells import Cell, Cells, Job, describe, digest
 from marl_sched.train.published.entries import Entries, Untrained
 from marl_sched.train.published.plan import Line, Row
 
-SCHEMA = 1
+SCHEMA = 2  # 1 named the horizon by its unit, as `hours`
 FAILURE_MODEL = "failure model"  # in a scheduler's `needs`
 
 
@@ -44,9 +44,12 @@ class Results:
             "quick": size == plan.quick,
             "instances": size.instances,
             "episodes": size.episodes,
-            plan.domain.unit: self._entries.horizon,
+            "horizon": self._entries.horizon,
+            "unit": plan.domain.unit,
             "seed": plan.seed,
             "bound": msgspec.to_builtins(size.bound),
+            "measure": plan.measure,
+            "source": plan.source,
             "reference": self._reference_row().label,
             "objectives": tables,
             "decentralisation": self._decentralisation(),
@@ -59,6 +62,7 @@ class Results:
         scales = {scale: self._scale(objective, scale) for scale in self._plan.scales}
         rows = [self._row(row, objective, scales) for row in self._plan.rows if self._stands_in(row, objective)]
         return {
+            "better": self._plan.domain.better,
             "scales": {
                 scale: {"bound": found["bound"], "best_rule": found["best_rule"]} for scale, found in scales.items()
             },
@@ -78,7 +82,9 @@ class Results:
             ]
             for (one, published, scores), (other, less, more) in permutations(methods, 2):
                 difference = paired_difference(scores, more)
-                if published > less and difference.ci95 is not None and difference.ci95[1] < 0:
+                low, high = difference.ci95 or (0.0, 0.0)
+                better, otherwise = (published < less, low > 0) if self._lower else (published > less, high < 0)
+                if better and otherwise:
                     found.setdefault((one, other), {})[scale] = difference.as_json()
         return [{"lower": one, "higher": other, "scales": scales} for (one, other), scales in found.items()]
 
@@ -95,7 +101,7 @@ class Results:
         rules = {
             label: cell for label, cell in played.items() if cell.training is None and FAILURE_MODEL not in cell.needs
         }
-        best = max(rules, key=lambda label: float(np.mean(rules[label].M1)))
+        best = self._best({label: float(np.mean(cell.M1)) for label, cell in rules.items()})
         bound = self._made(self._entries.bound(objective, scale))
         return {
             "bound": {"M1": self._summary(bound), "seconds": bound.seconds, "cell": digest(bound.inputs)},
@@ -136,7 +142,7 @@ class Results:
             "mode": getattr(cell.inputs, "mode", None),
             "episodes": getattr(cell.inputs, "episodes", None),
             "M1": self._summary(cell),
-            "M2": {"mean": float(gain.mean()), "std": float(gain.std())},
+            "M2": {"mean": float(-gain.mean() if self._lower else gain.mean()), "std": float(gain.std())},
             "difference": paired_difference(scores, against["best"]).as_json(),
             "gap_closed": 100.0 * (float(scores.mean()) - base) / (bound - base),
             "visible_share": cell.visible_share,
@@ -160,7 +166,7 @@ class Results:
                 for label, figures in seeing_all
                 if "M1" in figures and FAILURE_MODEL not in figures["needs"]
             }
-            best = max(central, key=lambda label: central[label])
+            best = self._best(central)
             scales[scale] = {
                 "bound": against["bound"]["M1"]["mean"],
                 "central": {"label": best, "M1": central[best]},
@@ -200,6 +206,15 @@ class Results:
                 f"make what is missing with `{self._command}`"
             )
         return cell
+
+    @property
+    def _lower(self) -> bool:
+        """Whether a lower score is the better one."""
+        return self._plan.domain.better == "lower"
+
+    def _best(self, scores: Mapping[str, float]) -> str:
+        """The name with the best score, the first of equals."""
+        return (min if self._lower else max)(scores, key=lambda label: scores[label])
 
     def _reference_row(self) -> Row:
         reference = self._plan.domain.reference

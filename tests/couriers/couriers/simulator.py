@@ -10,7 +10,7 @@ import numpy as np
 from couriers import graph
 from couriers.instance import SCALES, CouriersInstance
 from marl_sched.errors import IllegalActionError, InvalidOptionError, require, require_integer
-from marl_sched.noise import FIRST_DOMAIN_STREAM, as_seed, episode_key, moment_key, uniform
+from marl_sched.noise import FIRST_DOMAIN_STREAM, as_seed, episode_key, time_key, uniform
 from marl_sched.simulation import Observation, TurnSimulator
 
 OBJECTIVES = ("waiting", "travel")
@@ -149,8 +149,8 @@ class CouriersSimulator(TurnSimulator):
         if not job["there"] or job["taken"] or slot in self.couriers["choice"][b]:
             self.conflict[b] = True
             return
-        moment = np.uint64(moment_key(self.episode_keys[b], self.time[b]))
-        days = int(job["work"]) + (uniform(moment, DELAY, slot, 0) < self.delay)
+        word = np.uint64(time_key(self.episode_keys[b], self.time[b]))
+        days = int(job["work"]) + (uniform(word, DELAY, slot, 0) < self.delay)
         courier["choice"] = slot
         self.end[b, slot] = self.until[b, agent] = self.time[b] + days
         distance = abs(int(job["place"]) - int(courier["home"]))

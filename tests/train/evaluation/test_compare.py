@@ -6,9 +6,10 @@ import pytest
 from marl_sched.agents.airme.schedulers import RULES
 from marl_sched.domain import get_domain
 from marl_sched.errors import InvalidFileError
+from marl_sched.problem import Problem
 from marl_sched.train.evaluation import plots
 from marl_sched.train.evaluation.compare import draw_learning_curves, play_episode, read_learning_curve
-from marl_sched.train.evaluation.evaluate import Settings, evaluate_scheduler
+from marl_sched.train.evaluation.evaluate import evaluate_scheduler
 
 AIRME = get_domain("airme")
 
@@ -26,7 +27,8 @@ def table(share, **rows):
         "view": {"kind": "local", "visible_share": share},
         "instances": 2,
         "episodes": 3,
-        "hours": 720,
+        "horizon": 720,
+        "unit": "hours",
         "schedulers": rows,
     }
 
@@ -54,7 +56,7 @@ def test_a_score_below_zero_has_room():
 
 def test_a_timeline_is_labelled_in_hours_and_planes():
     image = np.zeros((4 * 25, 2 * 48, 3), np.uint8)
-    figure = plots.timelines({"calm": image}, hours=48, legend={"flying": (1, 2, 3)}, band=("plane", 4))
+    figure = plots.timelines({"calm": image}, length=48, unit="hours", legend={"flying": (1, 2, 3)}, band=("plane", 4))
     axes = figure.axes[0]
     assert axes.get_title(loc="left") == "calm"
     assert (axes.get_xlim(), axes.get_ylim()) == ((0, 48), (25.5, 0.5))
@@ -63,9 +65,9 @@ def test_a_timeline_is_labelled_in_hours_and_planes():
 
 def test_the_episode_that_is_drawn_is_the_first_one_that_was_scored():
     instances = AIRME.instances("small", 2, 4)
-    settings = Settings(episodes=2, seed=9, horizon=48, scale="small")
-    scores = evaluate_scheduler(AIRME, RULES["random"](), instances, settings)
-    drawn = play_episode(AIRME, RULES["random"](), instances[0], settings)
+    problem = Problem(AIRME, instances=instances, pad="small", episodes=2, seed=9, horizon=48)
+    scores = evaluate_scheduler(problem, RULES["random"]())
+    drawn = play_episode(problem, RULES["random"]())
     assert drawn.objectives()["profit"][0] == scores.measures["profit"][0, 0]
     assert AIRME.render["rgb_array"](drawn, 0).shape == (4 * instances[0].n_planes, 2 * 48, 3)
 
@@ -85,9 +87,10 @@ def test_the_columns_of_a_training_log_are_those_that_are_drawn():
     assert {compare.SECONDS, compare.SCORE} <= set(COLUMNS)
 
 
-def test_the_best_validation_is_marked():
-    figure = plots.learning_curves({"run": (np.array([1.0, 2.0, 3.0]), np.array([0.5, 0.61, 0.6]))})
-    assert [text.get_text() for text in figure.axes[0].texts] == ["0.610"]
+@pytest.mark.parametrize(("better", "best"), [("higher", "0.610"), ("lower", "0.500")])
+def test_the_best_validation_is_marked(better, best):
+    figure = plots.learning_curves({"run": (np.array([1.0, 2.0, 3.0]), np.array([0.5, 0.61, 0.6]))}, better=better)
+    assert [text.get_text() for text in figure.axes[0].texts] == [best]
 
 
 def test_a_log_that_cannot_be_read_is_named(tmp_path):
@@ -96,7 +99,7 @@ def test_a_log_that_cannot_be_read_is_named(tmp_path):
 
 
 def test_a_picture_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
-    figure = plots.learning_curves({"run": (np.array([1.0]), np.array([0.5]))})
+    figure = plots.learning_curves({"run": (np.array([1.0]), np.array([0.5]))}, better="higher")
     monkeypatch.setattr(figure, "savefig", lambda *_, **__: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         plots.save(figure, tmp_path / "curve.png")
@@ -109,7 +112,7 @@ def test_logs_of_folders_with_the_same_name_are_drawn_side_by_side(tmp_path, mon
         log.parent.mkdir(parents=True)
         log.write_text("seconds,validation\n60,0.5\n")
     drawn = {}
-    monkeypatch.setattr(plots, "learning_curves", lambda curves: drawn.update(curves))
+    monkeypatch.setattr(plots, "learning_curves", lambda curves, better: drawn.update(curves))
     monkeypatch.setattr(plots, "save", lambda figure, path: path)
-    draw_learning_curves(tmp_path / "out.png", logs)
+    draw_learning_curves(tmp_path / "out.png", logs, better="higher")
     assert list(drawn) == [str(logs[0]), str(logs[1]), "c"]

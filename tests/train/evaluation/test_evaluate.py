@@ -9,7 +9,8 @@ from marl_sched.agents.airme.schedulers import RULES
 from marl_sched.domain import get_domain
 from marl_sched.envs.airme.views import LocalView
 from marl_sched.errors import InvalidOptionError, UnknownNameError
-from marl_sched.train.evaluation.evaluate import Scores, Settings, Table, evaluate, evaluate_scheduler
+from marl_sched.problem import Problem
+from marl_sched.train.evaluation.evaluate import Scores, Table, evaluate, evaluate_scheduler
 
 AIRME = get_domain("airme")
 DAYS = 3 * 24
@@ -19,8 +20,10 @@ def fleets(count=3, seed=11):
     return AIRME.instances("small", count, seed)
 
 
-def settings(**changes):
-    return Settings(**{"episodes": 2, "seed": 7, "horizon": DAYS, "scale": "small", **changes})
+def problem(instances=None, **changes):
+    """The fleets, or instances, under the settings of most tests."""
+    given = {"instances": instances or fleets(), "episodes": 2, "seed": 7, "horizon": DAYS, "pad": "small"}
+    return Problem(AIRME, **{**given, **changes})
 
 
 def one_after_the_other(scheduler, instances, view, episodes, seed):
@@ -43,7 +46,7 @@ def one_after_the_other(scheduler, instances, view, episodes, seed):
 def test_scores_are_those_of_episodes_played_one_after_the_other(name, view):
     instances = fleets()
     expected, share = one_after_the_other(RULES[name](), instances, view, episodes=2, seed=7)
-    scores = evaluate_scheduler(AIRME, RULES[name](), instances, settings(view=view))
+    scores = evaluate_scheduler(problem(instances, view=view), RULES[name]())
     np.testing.assert_allclose(scores.measures["profit"], expected, rtol=0, atol=1e-12)
     # read at every eighth turn only
     assert scores.visible_share == pytest.approx(share, abs=0.02)
@@ -52,8 +55,8 @@ def test_scores_are_those_of_episodes_played_one_after_the_other(name, view):
 @pytest.mark.parametrize("max_rows", [1, 4, 5])
 def test_the_size_of_chunks_changes_nothing(max_rows):
     view = LocalView(reach=1, comm=1, staleness=3)
-    whole = evaluate_scheduler(AIRME, RULES["random"](), fleets(), settings(view=view))
-    chunked = evaluate_scheduler(AIRME, RULES["random"](), fleets(), settings(view=view), max_rows=max_rows)
+    whole = evaluate_scheduler(problem(view=view), RULES["random"]())
+    chunked = evaluate_scheduler(problem(view=view), RULES["random"](), max_rows=max_rows)
     assert chunked.visible_share == whole.visible_share
     for name, values in whole.measures.items():
         np.testing.assert_array_equal(chunked.measures[name], values)
@@ -62,28 +65,28 @@ def test_the_size_of_chunks_changes_nothing(max_rows):
 def test_the_order_of_instances_changes_nothing_but_the_order_of_scores():
     order = [2, 0, 1]
     instances = fleets()
-    straight = evaluate_scheduler(AIRME, RULES["condition"](), instances, settings())
-    permuted = evaluate_scheduler(AIRME, RULES["condition"](), [instances[i] for i in order], settings())
+    straight = evaluate_scheduler(problem(instances), RULES["condition"]())
+    permuted = evaluate_scheduler(problem([instances[i] for i in order]), RULES["condition"]())
     for name, values in straight.measures.items():
         np.testing.assert_array_equal(permuted.measures[name], values[order])
 
 
 def test_more_episodes_leave_the_first_ones_as_they_were():
-    few = evaluate_scheduler(AIRME, RULES["condition"](), fleets(), settings(episodes=2))
-    many = evaluate_scheduler(AIRME, RULES["condition"](), fleets(), settings(episodes=3))
+    few = evaluate_scheduler(problem(episodes=2), RULES["condition"]())
+    many = evaluate_scheduler(problem(episodes=3), RULES["condition"]())
     np.testing.assert_array_equal(many.measures["profit"][:, :2], few.measures["profit"])
     assert len(np.unique(many.measures["profit"])) == 9
 
 
 def test_another_seed_brings_other_noise():
-    one = evaluate_scheduler(AIRME, RULES["condition"](), fleets(), settings(seed=7))
-    other = evaluate_scheduler(AIRME, RULES["condition"](), fleets(), settings(seed=8))
+    one = evaluate_scheduler(problem(seed=7), RULES["condition"]())
+    other = evaluate_scheduler(problem(seed=8), RULES["condition"]())
     assert (one.measures["profit"] != other.measures["profit"]).all()
 
 
 def test_progress_only_grows_and_never_passes_the_whole():
     told = []
-    evaluate_scheduler(AIRME, RULES["condition"](), fleets(), settings(), max_rows=4, progress=told.append)
+    evaluate_scheduler(problem(), RULES["condition"](), max_rows=4, progress=told.append)
     assert told == sorted(told)
     assert 0 <= told[0] < 0.1
     assert 0.9 < told[-1] <= 1
@@ -97,9 +100,7 @@ def test_a_table_worked_out_by_hand():
     better = scores_of([[0.5, 0.7], [0.6, 0.6]], share=0.25)
     reference = scores_of([[0.4, 0.4], [0.5, 0.7]])
     table = Table(
-        domain=AIRME,
-        settings=settings(view=LocalView(reach=2), objective="profit"),
-        n_instances=2,
+        problem=problem(fleets(2), view=LocalView(reach=2), objective="profit"),
         scores={"better": better},
         reference=("plain", reference),
         baseline=("plain", None, reference),
@@ -126,10 +127,10 @@ def test_a_table_worked_out_by_hand():
 
 def test_the_table_has_the_keys_that_other_tools_read():
     schedulers = {"corrective": RULES["corrective"](), "mine": RULES["model-based"]()}
-    table = evaluate(AIRME, schedulers, fleets(), settings(), reference=RULES["corrective-published"]()).as_json()
+    table = evaluate(problem(), schedulers, reference=RULES["corrective-published"]()).as_json()
     assert json.loads(json.dumps(table, allow_nan=False)) == table
-    assert table["schema"] == 1
-    head = ("env", "scale", "objective", "view", "instances", "episodes", "hours", "seed")
+    assert table["schema"] == 2
+    head = ("env", "scale", "objective", "view", "instances", "episodes", "horizon", "unit", "seed")
     assert [table[key] for key in head] == [
         "airme",
         "small",
@@ -138,6 +139,7 @@ def test_the_table_has_the_keys_that_other_tools_read():
         3,
         2,
         DAYS,
+        "hours",
         7,
     ]
     assert list(table["schedulers"]) == ["corrective", "mine"]
@@ -153,7 +155,7 @@ def test_the_table_has_the_keys_that_other_tools_read():
 
 def test_m1_is_the_objective_that_was_asked_for():
     rules = {"condition": RULES["condition"]()}
-    table = evaluate(AIRME, rules, fleets(), settings(objective="availability")).as_json()
+    table = evaluate(problem(objective="availability"), rules).as_json()
     row = table["schedulers"]["condition"]
     assert table["objective"] == "availability"
     assert row["M1"] == row["availability"]
@@ -163,19 +165,19 @@ def test_m1_is_the_objective_that_was_asked_for():
 
 def test_the_gain_is_taken_to_the_reference_under_the_full_view_whatever_the_view_of_the_table():
     published = RULES["corrective-published"]()
-    blind = settings(view=LocalView(reach=0, comm=0))
-    local = evaluate(AIRME, {"corrective-published": published}, fleets(), blind, reference=published).as_json()
-    full = evaluate(AIRME, {"corrective-published": published}, fleets(), settings(), reference=published).as_json()
+    blind = problem(view=LocalView(reach=0, comm=0))
+    local = evaluate(blind, {"corrective-published": published}, reference=published).as_json()
+    full = evaluate(problem(), {"corrective-published": published}, reference=published).as_json()
     assert local["reference"] == full["reference"]
     assert full["schedulers"]["corrective-published"]["M2"]["mean"] == 0.0
     assert local["schedulers"]["corrective-published"]["M2"]["mean"] != 0.0
 
 
 def test_the_default_baseline_is_the_full_view_reference_whatever_else_is_in_the_table():
-    published, blind = RULES["corrective-published"](), settings(view=LocalView(reach=0, comm=0))
+    published, blind = RULES["corrective-published"](), problem(view=LocalView(reach=0, comm=0))
     alone = {"condition": RULES["condition"]()}
     tables = [
-        evaluate(AIRME, rules, fleets(), blind, reference=published).as_json()
+        evaluate(blind, rules, reference=published).as_json()
         for rules in (alone, {**alone, "corrective-published": published})
     ]
     for table in tables:
@@ -185,9 +187,9 @@ def test_the_default_baseline_is_the_full_view_reference_whatever_else_is_in_the
 
 
 def test_a_named_baseline_plays_under_the_view_of_the_table():
-    published, blind = RULES["corrective-published"](), settings(view=LocalView(reach=0, comm=0))
+    published, blind = RULES["corrective-published"](), problem(view=LocalView(reach=0, comm=0))
     rules = {"condition": RULES["condition"](), "corrective-published": published}
-    table = evaluate(AIRME, rules, fleets(), blind, reference=published, baseline="corrective-published").as_json()
+    table = evaluate(blind, rules, reference=published, baseline="corrective-published").as_json()
     assert table["baseline"]["view"] == {"kind": "local", "reach": 0, "comm": 0, "staleness": 0}
     row = table["schedulers"]["corrective-published"]
     assert row["difference"]["mean"] == 0.0
@@ -197,18 +199,18 @@ def test_a_named_baseline_plays_under_the_view_of_the_table():
 def test_a_reference_outside_the_table_is_no_baseline_by_name():
     rules, published = {"condition": RULES["condition"]()}, RULES["corrective-published"]()
     with pytest.raises(UnknownNameError, match="Known: condition"):
-        evaluate(AIRME, rules, fleets(), settings(), reference=published, baseline=published.name)
+        evaluate(problem(), rules, reference=published, baseline=published.name)
 
 
 def test_a_baseline_that_does_not_play_is_refused():
     with pytest.raises(UnknownNameError, match="did you mean 'condition'"):
-        evaluate(AIRME, {"condition": RULES["condition"]()}, fleets(), settings(), baseline="conditon")
+        evaluate(problem(), {"condition": RULES["condition"]()}, baseline="conditon")
 
 
 @pytest.mark.parametrize("wrong", [{"episodes": 0}, {"horizon": 0}, {"horizon": -1}])
-def test_settings_without_anything_to_play_are_refused(wrong):
+def test_a_problem_without_anything_to_play_are_refused(wrong):
     with pytest.raises(InvalidOptionError, match=next(iter(wrong))):
-        evaluate_scheduler(AIRME, RULES["condition"](), fleets(), settings(**wrong))
+        evaluate_scheduler(problem(**wrong), RULES["condition"]())
 
 
 PUBLISHED = {  # M1 for profit, its tolerance, and revenue and availability
@@ -223,7 +225,9 @@ PUBLISHED = {  # M1 for profit, its tolerance, and revenue and availability
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_published_rules_reach_the_published_scores(name):
     profit, tolerance, revenue, availability = PUBLISHED[name]
-    scores = evaluate_scheduler(AIRME, RULES[name](), fleets(1000, seed=5), Settings(episodes=2, seed=1, scale="small"))
+    scores = evaluate_scheduler(
+        Problem(AIRME, instances=fleets(1000, seed=5), pad="small", episodes=2, seed=1), RULES[name]()
+    )
     means = {measure: values.mean() for measure, values in scores.measures.items()}
     assert means["profit"] == pytest.approx(profit, abs=tolerance)
     assert means["revenue"] == pytest.approx(revenue, abs=0.012)
@@ -234,19 +238,15 @@ def test_published_rules_reach_the_published_scores(name):
 @pytest.mark.parametrize(("scale", "count"), [("small", 100), ("medium", 50), ("large", 25)])
 def test_serving_worn_planes_first_keeps_its_score_on_every_scale(scale, count):
     instances = AIRME.instances(scale, count, 5)
-    scores = evaluate_scheduler(
-        AIRME, RULES["preventive-first"](), instances, Settings(episodes=2, seed=1, scale=scale)
-    )
+    chosen = Problem(AIRME, instances=instances, pad=scale, episodes=2, seed=1)
+    scores = evaluate_scheduler(chosen, RULES["preventive-first"]())
     assert scores.measures["profit"].mean() >= 0.700
 
 
 def test_rounds_are_told_one_by_one_and_failures_count():
-    murse = get_domain("murse")
-    instances = murse.instances("small", 3, 1)
-    few = Settings(episodes=2, seed=1, horizon=3, scale="small")
-    table = evaluate(murse, {"random": RULES["random"]()}, instances, few).as_json()
+    table = evaluate(Problem("murse", count=3, episodes=2, seed=1, horizon=3), {"random": RULES["random"]()}).as_json()
     row = table["schedulers"]["random"]
-    assert (table["rounds"], table["better"], "hours" in table) == (3, "lower", False)
+    assert (table["horizon"], table["unit"], table["better"]) == (3, "rounds", "lower")
     for name in ("feasible", "makespan"):
         assert len(row[name]["per_round"]) == 3
         assert np.mean(row[name]["per_round"]) == pytest.approx(row[name]["mean"])
@@ -259,15 +259,12 @@ def test_rounds_are_told_one_by_one_and_failures_count():
 
 
 def test_the_gap_to_the_exact_solver_is_in_percent_of_its_score():
-    murse = get_domain("murse")
     scores = {
         "exact": Scores(measures={"makespan": np.array([[50.0], [80.0]])}, visible_share=1.0, seconds=1.0),
         "quick": Scores(measures={"makespan": np.array([[60.0], [80.0]])}, visible_share=1.0, seconds=1.0),
     }
     table = Table(
-        domain=murse,
-        settings=settings(objective="makespan"),
-        n_instances=2,
+        problem=Problem("murse", count=2),
         scores=scores,
         reference=None,
         baseline=("exact", None, scores["exact"]),
@@ -287,7 +284,6 @@ class Talkative(type(RULES["random"]())):
 
 
 def test_what_a_scheduler_counts_of_itself_is_told_by_round():
-    murse = get_domain("murse")
-    few = Settings(episodes=2, seed=1, horizon=3, scale="small")
-    table = evaluate(murse, {"talkative": Talkative()}, murse.instances("small", 2, 1), few).as_json()
+    few = Problem("murse", count=2, episodes=2, seed=1, horizon=3)
+    table = evaluate(few, {"talkative": Talkative()}).as_json()
     assert table["schedulers"]["talkative"]["messages"] == {"mean": 1.0, "per_round": [1.0, 1.0, 1.0]}

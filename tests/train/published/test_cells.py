@@ -18,7 +18,8 @@ from marl_sched.agents.policies.cards import read_card, write_card
 from marl_sched.domain import get_domain
 from marl_sched.envs.airme.views import LocalView
 from marl_sched.errors import InvalidFileError, MarlSchedError
-from marl_sched.train.evaluation.evaluate import Settings, evaluate_scheduler
+from marl_sched.problem import Problem
+from marl_sched.train.evaluation.evaluate import evaluate_scheduler
 from marl_sched.train.published import filling
 from marl_sched.train.published.cells import Bound, Cell, Job, Play, digest, make
 from marl_sched.train.published.entries import Entries
@@ -79,8 +80,8 @@ def test_the_name_does_not_depend_on_the_order_of_a_views_options():
 
 def test_a_cell_holds_what_the_evaluation_of_its_inputs_gives():
     (cell,) = make(Job(PLAY))
-    settings = Settings(episodes=3, seed=5, view=LocalView(staleness=2), horizon=8, scale="small")
-    scores = evaluate_scheduler(AIRME, RULES["condition"](), AIRME.instances("small", 2, 5), settings)
+    problem = Problem(AIRME, count=2, episodes=3, seed=5, view=LocalView(staleness=2), horizon=8)
+    scores = evaluate_scheduler(problem, RULES["condition"]())
     profit = scores.measures["profit"]
     np.testing.assert_allclose(cell.M1, profit.mean(axis=1), rtol=0, atol=5e-7)
     between = [np.mean([(x - row.mean()) ** 2 for x in row]) for row in profit]
