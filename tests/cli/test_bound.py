@@ -12,7 +12,7 @@ def test_bound_is_written_per_instance_and_its_mean_is_told(run, tmp_path):
     assert ended.code == 0
     result = json.loads(file.read_text())
     assert result["objective"] == "availability"
-    assert result["hours"] == 24
+    assert (result["horizon"], result["unit"]) == (24, "hours")
     assert len(result["per_instance"]) == result["instances"] == 2
     assert result["M1"]["mean"] == pytest.approx(sum(result["per_instance"]) / 2)
     assert 0.3 < result["M1"]["mean"] < 1.0
