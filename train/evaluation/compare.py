@@ -102,5 +102,5 @@ def read_curve(log: Path, xs: Sequence[str], y: str) -> tuple[np.ndarray, np.nda
             raise InvalidFileError(log, f"line {line}", "numbers", f"{row[x]}, {row[y]}") from error
     if not points:
         raise InvalidFileError(log, "", f"at least one row with a value of {y!r}")
-    xs, ys = np.array(points).T
-    return xs, ys
+    along, values = np.array(points).T
+    return along, values
