@@ -76,7 +76,7 @@ def evaluate_scheduler(
     for rows in _chunks(total, max_rows or _rows_that_fit(problem)):
         simulator = problem.simulator([row // problem.episodes for row in rows], **own_options(scheduler, problem))
         simulator.reset(seed=problem.seed, episodes=[row % problem.episodes for row in rows])
-        shares.start = rows.start
+        shares.begin(rows.start)
         play(scheduler, simulator, shares)
         measures.append(simulator.objectives())
         per_round.append({**simulator.per_round(), **scheduler.per_round()})
@@ -100,6 +100,12 @@ class _Shares:
     def __init__(self, total: int, progress: Progress | None) -> None:
         self.start, self._total, self._progress = 0, total, progress
         self._sum, self._turns = 0.0, 0
+
+    def begin(self, start: int) -> None:
+        """Look on at the episodes from number `start` on."""
+        self.start = start
+        if self._progress is not None:
+            self._progress(start / self._total)
 
     def before(self, simulator: TurnSimulator, number: int) -> None:
         """Read the shares of the acting agents at every few decisions."""
