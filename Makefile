@@ -9,19 +9,22 @@ PYTEST_ARGS ?=
 
 WORKERS ?= 2
 
-.PHONY: demo test unit wheel lint tables-airme format clean
+.PHONY: help demo test unit wheel lint coverage tables-airme format clean
+
+help: ## what there is to make
+	@grep -hE '^[a-z%-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z%-]+):.*## (.*)/  \1|\2/' | column -t -s '|'
 
 demo: $(INSTALLED) ## seven crews as processes for thirty days, compared with central schedulers; writes out/demo/
 	$(BIN)/marl-sched demo
 
 test: unit wheel ## all tests, then the wheel in a second environment
 
-unit: $(INSTALLED)
+unit: $(INSTALLED) ## the tests alone; PYTEST_ARGS="-n auto -k noise" are pytest's
 	NUMBA_CACHE_DIR=$(CURDIR)/build/numba OMP_NUM_THREADS=1 $(BIN)/pytest $(PYTEST_ARGS)
 
 # The second environment borrows the dependencies of the first through a .pth file; the editable install does not
 # come along, since .pth files are not read from there. The wheel must do without the checkout.
-wheel: $(INSTALLED)
+wheel: $(INSTALLED) ## the wheel in a second environment
 	rm -rf build
 	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir build/wheel .
 	$(BIN)/python -m venv --without-pip $(WHEEL_VENV)
@@ -31,13 +34,15 @@ wheel: $(INSTALLED)
 	cd $(WHEEL_VENV) && bin/marl-sched --version && bin/marl-sched list
 	cd $(WHEEL_VENV) && bin/python -c "from marl_sched.train.config import load_config; load_config([])" # the YAML ships
 
-# Types are checked where the package is whole: installed. From the root mypy would see the core alone.
-lint: $(INSTALLED) ## style, formatting, types
+lint: $(INSTALLED) ## style, formatting, spelling, types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	rm -rf build
-	$(BIN)/python -m pip install --quiet --no-deps --target build/typecheck .
-	cd build/typecheck && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache -p marl_sched
+	$(BIN)/codespell
+	$(BIN)/mypy -p marl_sched
+
+coverage: $(INSTALLED) ## which lines of what is not compiled no test runs, in build/coverage/
+	OMP_NUM_THREADS=1 NUMBA_CACHE_DIR=$(CURDIR)/build/numba $(BIN)/pytest --cov --cov-report=term:skip-covered \
+		--cov-report=html:build/coverage $(PYTEST_ARGS)
 
 tables-airme: $(INSTALLED) ## tables 6.2 to 6.4 in docs/results/, only the cells that are missing; QUICK=1: a look, in out/tables/
 	$(BIN)/marl-sched tables --env airme --workers $(WORKERS) $(if $(QUICK),--quick)
