@@ -4,7 +4,7 @@ from setuptools import find_packages, setup
 
 ROOMS = ("envs", "agents", "train", "comms", "configs")
 
-# In a checkout `marl_sched/envs` and the others are links to the rooms, so that editors and mypy find the whole package.
+# In a checkout `marl_sched/envs` and the others are links to the rooms: editors and mypy find the package by them.
 packages = find_packages(include=["marl_sched", "marl_sched.*"], exclude=[f"marl_sched.{room}*" for room in ROOMS])
 for room in ROOMS:
     packages += [f"marl_sched.{package}" for package in find_packages(include=[room, f"{room}.*"])]
