@@ -25,7 +25,6 @@ from marl_sched.simulation import TurnSimulator
 
 SCHEMA = 1
 BATCH = 1024
-SCALES = ("small", "large")
 _AEC_TURNS = 5_000
 _TORCHRL_STEPS = 100
 _POLICY_DECISIONS = 200
@@ -49,7 +48,7 @@ def bench(domain: Domain, *, repeats: int = 5) -> dict[str, Any]:
             **{name: each.per_second * _best(repeats, each.prepare, each.play) for name, each in own.items()},
             "aec_turns_per_s": aec_turns_per_second(domain, repeats),
             "torchrl_decisions_per_s": torchrl_decisions_per_second(domain, repeats),
-            "policy_ms": {scale: policy_milliseconds(domain, scale, repeats) for scale in SCALES},
+            "policy_ms": {scale: policy_milliseconds(domain, scale, repeats) for scale in _scales(domain)},
         }
     finally:
         torch.set_num_threads(threads)
@@ -63,9 +62,15 @@ def bench(domain: Domain, *, repeats: int = 5) -> dict[str, Any]:
     return {**head, **figures, "meaning": {**{name: each.meaning for name, each in own.items()}, **_MEANINGS}}
 
 
+def _scales(domain: Domain) -> list[str]:
+    """What is measured: the scales small and large, or of a domain without them its first and its last."""
+    names = list(domain.scales)
+    return ["small", "large"] if {"small", "large"} <= set(names) else [names[0], names[-1]]
+
+
 def aec_turns_per_second(domain: Domain, repeats: int) -> float:
     """Turns of the AEC environment per second, each with an observation and a random legal choice."""
-    env = SchedulingAEC(domain)
+    env = SchedulingAEC(domain, scale=_scales(domain)[0])
     uniforms = np.random.default_rng(0).random(_AEC_TURNS)
 
     def play() -> None:
@@ -82,7 +87,7 @@ def aec_turns_per_second(domain: Domain, repeats: int) -> float:
 
 def torchrl_decisions_per_second(domain: Domain, repeats: int) -> float:
     """Decisions per second of a TorchRL batch that is stepped without storing a rollout."""
-    env = SchedulingTorchRL(domain, batch_size=BATCH)
+    env = SchedulingTorchRL(domain, batch_size=BATCH, scale=_scales(domain)[0])
     state = {"now": env.reset()}
 
     def play() -> None:

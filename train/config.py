@@ -10,7 +10,6 @@ from __future__ import annotations
 import inspect
 import shlex
 from collections.abc import Sequence
-from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -30,6 +29,7 @@ from marl_sched.files import read_json
 from marl_sched.train.algorithms.base import AlgorithmConfig, algorithm_config
 from marl_sched.train.bounds import Count, Group, Natural, NonNegative, Seed
 from marl_sched.train.device import DeviceName
+from marl_sched.train.groups import chosen_domain, offer
 
 # Arguments of every domain's simulator that other keys of the configuration, or the trainer, decide on.
 _SET_ELSEWHERE = {"instances", "view", "objective", "horizon", "seed", "pad"}
@@ -150,6 +150,7 @@ def load_config(overrides: Sequence[str]) -> TrainConfig:
         path = override.partition("=")[0].lstrip("+~")
         _refuse_renamed(path.split("."))
     GlobalHydra.instance().clear()
+    offer(chosen_domain(overrides))
     try:
         with initialize_config_module("marl_sched.configs", version_base="1.3"):
             composed = OmegaConf.to_container(compose("train", list(overrides)), resolve=True)
@@ -187,12 +188,6 @@ def _registered(kind: type, content: Any) -> Any:
 def _checked(config: TrainConfig) -> TrainConfig:
     """Look up every name in the registry of domains."""
     domain = get_domain(config.env.name)
-    groups = {path.name.removesuffix(".yaml") for path in files("marl_sched.configs").joinpath("env").iterdir()}
-    if config.env.name not in groups:
-        raise InvalidOptionError(
-            f"train: env.name: {config.env.name} cannot be learned yet, as there is no file of that name in "
-            f"configs/env; known: {', '.join(sorted(groups))}"
-        )
     for scale in config.env.scales:
         domain.require_scale(scale)
     domain.require_objective(config.env.objective)

@@ -5,6 +5,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from marl_sched.domain import get_domain
 from marl_sched.envs.airme.views import FullView, LocalView
 from marl_sched.errors import InvalidFileError, InvalidOptionError, UnknownNameError
 from marl_sched.files import write_json
@@ -61,9 +62,12 @@ def test_unknown_names_are_refused_before_anything_runs(override: str):
         load_config([override])
 
 
-def test_a_domain_without_a_configuration_cannot_be_learned():
-    with pytest.raises(InvalidOptionError, match=r"env\.name: murse cannot be learned yet, .* known: airme"):
-        load_config(["env.name=murse", "env.objective=makespan"])
+def test_every_domain_and_its_views_bring_their_own_groups():
+    config = load_config(["env=murse", "view=local", "view.sensing=2.5"])
+    murse = get_domain("murse")
+    assert (config.env.name, config.env.scales, config.env.objective) == ("murse", ["small"], "makespan")
+    assert config.make_view() == murse.view("local", sensing=2.5)
+    assert config.curriculum.stop == murse.default_horizon
 
 
 def test_runs_that_differ_in_view_algorithm_or_network_have_folders_of_their_own():
