@@ -9,8 +9,8 @@ import pytest
 
 FEW = ("--instances", 2, "--episodes", 1)
 TINY = (
-    "env=couriers-deployable", "view=near", "view.reach=2", "algorithm=gae", "algorithm.instances=4", "algorithm.turns=20",
-    "validation.instances=2", "validation.every=1", "save_every=1",
+    "env=couriers-deployable", "view=near", "view.reach=2", "algorithm=gae", "algorithm.instances=4",
+    "algorithm.turns=20", "validation.instances=2", "validation.every=1", "save_every=1",
 )  # fmt: skip
 
 
