@@ -28,12 +28,12 @@ def print_scores(results: dict[str, Any]) -> None:
     for name, row in sorted(results["schedulers"].items(), key=lambda item: item[1]["M1"]["mean"], reverse=not lower):
         m1, difference = row["M1"], row["difference"]
         cells = [
-            f"{_number(m1['mean'], 4)}\n± {_number(m1['std'], 3)}",
-            f"{_number(m1['iqm'], 4)}\n{_interval(m1['ci95'])}",
-            f"{_number(difference['mean'], 4, '+')}\n{_interval(difference['ci95'])}",
+            f"{_number(m1['mean'], 4)}\n{_spread(m1)}",
+            f"{_number(m1['iqm'], 4)}\n{_intervals(m1)}",
+            f"{_number(difference['mean'], 4, '+')}\n{_intervals(difference)}",
         ]
-        cells += [f"{row[name]['mean']:.1f}\n± {row[name]['std']:.1f}" for name in ("M2",) if gain]
-        cells += [f"{_number(row[measure]['mean'], 4)}\n± {_number(row[measure]['std'], 3)}" for measure in measures]
+        cells += [f"{row[name]['mean']:.1f}\n{_spread(row[name], 1)}" for name in ("M2",) if gain]
+        cells += [f"{_number(row[measure]['mean'], 4)}\n{_spread(row[measure])}" for measure in measures]
         table.add_row("\n".join([name, *_notes(results, row)]), *cells)
     console.print(table)
 
@@ -65,7 +65,7 @@ def _caption(results: dict[str, Any]) -> str:
         f"{results['instances']} instances x {results['episodes']} episodes, seed {results['seed']}; view {seen}, "
         f"{100 * share:.0f} % of the graph seen{'' if local or kind == 'full' else ', too much to be local'}. "
         f"difference: paired, to {baseline['scheduler']} with the {baseline['view']['kind']} view. "
-        "±: over instances; [ ]: 95 percent intervals"
+        "±: over instances; 95 percent intervals: [ ] over such instances, ( ) over other noise on these instances"
     )
 
 
@@ -89,8 +89,16 @@ def _other_measures(results: dict[str, Any]) -> list[str]:
     return [name for name, value in row.items() if isinstance(value, dict) and "std" in value and name not in known]
 
 
-def _interval(bounds: list[float] | None) -> str:
-    return "" if bounds is None else f"[{_number(bounds[0], 3)}, {_number(bounds[1], 3)}]"
+def _intervals(of: dict[str, Any]) -> str:
+    """The interval over such instances in brackets, over the noise of these instances in parentheses."""
+    such, these = of["ci95_such_instances"], of["ci95_these_instances"]
+    lines = [f"[{_number(such[0], 3)}, {_number(such[1], 3)}]"] if such else []
+    lines += [f"({_number(these[0], 3)}, {_number(these[1], 3)})"] if these else []
+    return "\n".join(lines)
+
+
+def _spread(of: dict[str, Any], decimals: int = 3) -> str:
+    return "one instance" if of["std"] is None else f"± {_number(of['std'], decimals)}"
 
 
 def _number(value: float, decimals: int, sign: str = "") -> str:

@@ -164,7 +164,11 @@ class Table:
     baseline: tuple[str, Any, Scores]
 
     def as_json(self) -> dict[str, Any]:
-        """The table as schema 2 of `marl-sched evaluate --json`."""
+        """The table as schema 2 of `marl-sched evaluate --json`.
+
+        `scores` of a scheduler are its M1 in every episode, a list for each instance: two runs on the same instances
+        with the same seed are paired episode by episode.
+        """
         problem = self.problem
         data: dict[str, Any] = {
             "schema": SCHEMA,
@@ -200,7 +204,7 @@ class Table:
     def _row(self, scores: Scores) -> dict[str, Any]:
         objective = self.problem.objective
         m1 = scores.measures[objective]
-        row: dict[str, Any] = {"M1": self._summary(m1).as_json()}
+        row: dict[str, Any] = {"M1": self._summary(m1).as_json(), "scores": m1.tolist()}
         if self.reference is not None:
             gain = percent_gain(m1, self.reference[1].measures[objective])
             row["M2"] = self._summary(-gain if self.problem.domain.better == "lower" else gain).as_json()
@@ -220,8 +224,7 @@ class Table:
         return row
 
     def _summary(self, values: np.ndarray) -> Summary:
-        # the same resamples for every row: intervals of equal scores are equal
-        return summarise(values, np.random.default_rng(self.problem.seed))
+        return summarise(values)
 
 
 def evaluate(

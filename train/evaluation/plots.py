@@ -39,7 +39,9 @@ def score_bars(*tables: Mapping[str, Any]) -> Figure:
     rows.sort(key=lambda row: row[1]["mean"], reverse=tables[0]["better"] == "lower")
     scores = [score for _, score, _ in rows]
     iqm = np.array([score["iqm"] for score in scores])
-    low, high = np.array([score["ci95"] for score in scores]).T
+    kind = "such" if all(score["ci95_such_instances"] for score in scores) else "these"
+    drawn = [score[f"ci95_{kind}_instances"] or [score["iqm"]] * 2 for score in scores]
+    low, high = np.array(drawn).T
     means = np.array([score["mean"] for score in scores])
     figure = Figure(figsize=(8.5, 1.7 + 0.4 * len(rows)), layout="constrained")
     axes = figure.add_subplot()
@@ -60,7 +62,16 @@ def score_bars(*tables: Mapping[str, Any]) -> Figure:
     axes.grid(axis="x", color=_FAINT, lw=0.6)
     axes.tick_params(axis="y", length=0)
     handles: list[Any] = [Patch(color=_BARS[i % len(_BARS)], label=_view(table)) for i, table in enumerate(tables)]
-    handles.append(Line2D([], [], color=_INK, marker="|", ms=8, label="95 % interval of the interquartile mean (bar)"))
+    handles.append(
+        Line2D(
+            [],
+            [],
+            color=_INK,
+            marker="|",
+            ms=8,
+            label=f"95 % interval of the interquartile mean (bar), {kind} instances",
+        )
+    )
     handles.append(Line2D([], [], color=_INK, marker="D", ms=4, ls="none", label="mean"))
     figure.legend(handles=handles, loc="outside lower right", ncols=len(handles), frameon=False, fontsize=8)
     return figure

@@ -121,7 +121,7 @@ def _against(entry: Mapping[str, Any]) -> str:
     """Interquartile mean and paired difference, each with its interval."""
     if "M1" not in entry:
         return _NONE
-    low, high = entry["M1"]["ci95"]
+    low, high = entry["M1"]["ci95_such_instances"]
     return f"{entry['M1']['iqm']:.4f} [{low:.4f}, {high:.4f}]<br>{_difference(entry['difference'])}"
 
 
@@ -244,9 +244,9 @@ def _spread(measure: str, mean: float, std: float) -> str:
 
 def _difference(difference: Mapping[str, Any]) -> str:
     told = f"{difference['mean']:+.4f}"
-    if difference["ci95"] is None:
+    if difference["ci95_such_instances"] is None:
         return told
-    low, high = difference["ci95"]
+    low, high = difference["ci95_such_instances"]
     return f"{told} [{low:+.4f}, {high:+.4f}]"
 
 

@@ -41,7 +41,7 @@ def _learned(table: Mapping[str, Any]) -> str:
     above = [
         label
         for label, differences in learned.items()
-        if all(each["ci95"] is not None and min(sign * end for end in each["ci95"]) > 0 for each in differences)
+        if all(min(sign * end for end in each["ci95_such_instances"] or [0.0]) > 0 for each in differences)
     ]
     if not above:
         return "No learned scheduler passes the best rule with an interval above zero on every scale that it plays."

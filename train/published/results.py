@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from marl_sched.errors import MarlSchedError
-from marl_sched.statistics import paired_difference, percent_gain, summarise
+from marl_sched.statistics import CONFIDENCE, holm, paired_difference, percent_gain, summarise
 from marl_sched.train.published.cells import Cell, Cells, Job, describe, digest
 from marl_sched.train.published.entries import Entries, Untrained
 from marl_sched.train.published.plan import Line, Row
@@ -71,7 +71,10 @@ class Results:
         }
 
     def _contradictions(self, objective: str) -> list[dict[str, Any]]:
-        """Pairs of methods that stand in another order than published, with an interval that excludes zero."""
+        """Pairs of methods that stand in another order than published, beyond chance at 5 percent.
+
+        So many pairs are looked at that the p-values of a scale are corrected for it (marl_sched.statistics.holm).
+        """
         found: dict[tuple[str, str], dict[str, Any]] = {}
         for scale in self._plan.scales:
             methods = [
@@ -80,12 +83,16 @@ class Results:
                 if scale in row.published.get(objective, {})
                 and (cell := self._cell(self._entries.row(row, objective, scale))) is not None
             ]
-            for (one, published, scores), (other, less, more) in permutations(methods, 2):
-                difference = paired_difference(scores, more)
-                low, high = difference.ci95 or (0.0, 0.0)
-                better, otherwise = (published < less, low > 0) if self._lower else (published > less, high < 0)
-                if better and otherwise:
-                    found.setdefault((one, other), {})[scale] = difference.as_json()
+            sign = -1 if self._lower else 1
+            pairs = {
+                (one, other): paired_difference(scores, more)
+                for (one, published, scores), (other, less, more) in permutations(methods, 2)
+                if sign * published > sign * less
+            }
+            corrected = holm([1.0 if difference.p is None else difference.p for difference in pairs.values()])
+            for (pair, difference), p in zip(pairs.items(), corrected, strict=True):
+                if sign * difference.mean < 0 and p < 1 - CONFIDENCE:
+                    found.setdefault(pair, {})[scale] = difference.as_json()
         return [{"lower": one, "higher": other, "scales": scales} for (one, other), scales in found.items()]
 
     def _stands_in(self, row: Row, objective: str) -> bool:
@@ -221,8 +228,7 @@ class Results:
         return next(row for row in self._plan.rows if row.rule == reference and _is_full(row.view))
 
     def _summary(self, cell: Cell) -> dict[str, Any]:
-        # the same resamples for every row: intervals of equal scores are equal
-        return summarise(_scores(cell), np.random.default_rng(self._plan.seed)).as_json()
+        return summarise(_scores(cell)).as_json()
 
 
 def _is_full(view: Mapping[str, Any]) -> bool:

@@ -145,8 +145,12 @@ def test_the_table_has_the_keys_that_other_tools_read():
     assert list(table["schedulers"]) == ["corrective", "mine"]
     for row in table["schedulers"].values():
         for measure in ("M1", "M2", "profit", "revenue", "availability"):
-            assert set(row[measure]) == {"mean", "std", "iqm", "ci95"}
-            assert row[measure]["ci95"][0] <= row[measure]["iqm"] <= row[measure]["ci95"][1]
+            assert set(row[measure]) == {"mean", "std", "iqm", "ci95_these_instances", "ci95_such_instances"}
+            for kind in ("these", "such"):
+                low, high = row[measure][f"ci95_{kind}_instances"]
+                assert low <= row[measure]["iqm"] <= high
+        assert np.shape(row["scores"]) == (3, 2)
+        assert np.mean(row["scores"]) == pytest.approx(row["M1"]["mean"], abs=1e-12)
         assert row["M1"] == row["profit"]
         assert row["seconds"] > 0
     assert table["schedulers"]["mine"]["needs"] == "failure model"

@@ -48,7 +48,7 @@ def test_differences_are_to_the_best_rule_that_does_not_know_the_failure_model(r
     difference = row(results, "net")["scales"]["small"]["difference"]
     assert difference["mean"] == pytest.approx(0.15)  # 0.2 and 0.1
     reach = stats.t.ppf(0.975, 1) * 0.05  # standard error of two numbers 0.1 apart
-    assert difference["ci95"] == pytest.approx([0.15 - reach, 0.15 + reach], abs=1e-6)
+    assert difference["ci95_such_instances"] == pytest.approx([0.15 - reach, 0.15 + reach], abs=1e-6)
 
 
 def test_an_order_is_contradicted_only_by_more_than_chance(entries, cells, trained, write, plan):
