@@ -73,8 +73,8 @@ def _ranks(table: Mapping[str, Any]) -> str:
     if not found:
         return "No two methods of the dissertation stand in another order here by more than chance explains."
     return (
-        f"Of the dissertation's methods some stand here in another order than published, with a 95 percent interval "
-        f"of their paired difference that excludes zero: {'; '.join(found)}."
+        "Of the dissertation's methods some stand here in another order than published, beyond chance at 5 percent "
+        f"over all pairs of a scale (Holm's correction): {'; '.join(found)}."
     )
 
 
