@@ -11,10 +11,12 @@ from marl_sched.cli import options
 from marl_sched.errors import InvalidOptionError
 
 if TYPE_CHECKING:
-    from marl_sched.train.published.cells import Cells, Job
+    from marl_sched.train.published.cells import Job
     from marl_sched.train.published.entries import Untrained
+    from marl_sched.train.published.store import Cells
 
 FOLDER, QUICK_FOLDER = Path("docs/results"), Path("out/tables")
+SAMPLE = 10  # cells that are played again where kernels have changed
 UNTRAINED = 3  # exit code when the page is made, but lacks policies
 
 
@@ -41,11 +43,11 @@ def tables(
     Run it at the root of a checkout. It can be stopped and started again; finished cells are kept. Ends with 3 if
     policies of the list are not trained yet; the page names them.
     """
-    from marl_sched.train.published.cells import Cells
     from marl_sched.train.published.entries import Entries
     from marl_sched.train.published.filling import missing
     from marl_sched.train.published.page import write_pages
     from marl_sched.train.published.plan import load_plan
+    from marl_sched.train.published.store import Cells
 
     if render and without_policies:
         raise InvalidOptionError("--render, --without-policies: expected one of them, together nothing is left to do")
@@ -54,8 +56,9 @@ def tables(
     plan = load_plan(env)
     entries = Entries(plan, plan.quick if quick else plan.full, Path())
     jobs, untrained = entries.all()
-    cells = Cells(out / env)
+    cells = Cells(out / env / "cells.jsonl")
     if not render:
+        _confirm(cells, jobs)
         chosen = [job for job in jobs if job.weights is None] if without_policies else jobs
         _fill(missing(chosen, cells), cells, workers)
     if without_policies:
@@ -64,6 +67,20 @@ def tables(
     for path in write_pages(entries, cells, command, out):
         typer.echo(path)
     _tell(untrained)
+
+
+def _confirm(cells: Cells, jobs: list[Job]) -> None:
+    """Play some cells again where kernels have changed since they were made, and say what came of it."""
+    from marl_sched.train.published.store import confirm
+
+    stale = len(cells.stale())
+    if not stale:
+        return
+    differing = confirm(cells, jobs, SAMPLE)
+    if differing:
+        typer.echo(f"the kernels score differently ({'; '.join(differing)}): {stale} cells are made again", err=True)
+    else:
+        typer.echo(f"{stale} cells of earlier kernels hold: {SAMPLE} of them were played again and agree", err=True)
 
 
 def _fill(jobs: list[Job], cells: Cells, workers: int) -> None:

@@ -1,11 +1,8 @@
-"""A cell of the tables: one scheduler on all instances of a scale, kept as JSON under the hash of its inputs.
+"""A cell of the tables: one scheduler on all instances of a scale, known by the hash of its inputs.
 
-    docs/results/airme/0a1b2c3d4e5f6071.json
-
-The hash covers everything that decides the scores: whoever plays (the weights' SHA-256, if it is a policy), what is
-played, and `SCHEMA`, which counts the changes of simulators, rules, bounds, networks and this format that make old
-cells void: code is not hashed, whoever changes what it scores raises the number. A cell that exists is therefore never
-played again, and one whose inputs have changed is not found.
+The hash covers what is played and whoever plays (the weights' SHA-256, if it is a policy). Beside it a cell holds the
+digest of the kernels that it was made with, see `marl_sched.train.published.store`. `SCHEMA` counts the changes of
+rules, bounds, networks and this format that make old cells void.
 """
 
 from __future__ import annotations
@@ -26,7 +23,7 @@ from marl_sched.agents.policies.cards import read_card, source_revision
 from marl_sched.agents.registry import create_scheduler
 from marl_sched.domain import get_domain
 from marl_sched.errors import InvalidFileError, InvalidOptionError
-from marl_sched.files import read_json, write_json
+from marl_sched.kernels import sources_digest
 from marl_sched.problem import Problem
 from marl_sched.train.evaluation.evaluate import evaluate_scheduler
 
@@ -93,6 +90,7 @@ class Cell(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         training: of a learned scheduler.
         seconds: that it took.
         revision: of the source that made it.
+        kernels: digest of the kernels that it was made or confirmed with; None: it is older than these digests.
     """
 
     inputs: Inputs
@@ -103,6 +101,7 @@ class Cell(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     training: Training | None = None
     seconds: float
     revision: str
+    kernels: str | None = None
 
 
 @dataclass(frozen=True)
@@ -145,38 +144,6 @@ def weights_sha256(path: Path) -> str:
     """SHA-256 of a policy's weights file."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-class Cells:
-    """The cells in a folder."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-
-    def path(self, inputs: Inputs) -> Path:
-        """Where the cell of these inputs is, or would be."""
-        return self.folder / f"{digest(inputs)}.json"
-
-    def read(self, inputs: Inputs) -> Cell | None:
-        """The cell of these inputs, None if there is none yet; InvalidFileError if it is damaged or another's."""
-        path = self.path(inputs)
-        if not path.exists():
-            return None
-        try:
-            cell = msgspec.convert(read_json(path), Cell)
-        except msgspec.ValidationError as error:
-            raise InvalidFileError(path, "", f"a cell of schema {SCHEMA} ({error})") from error
-        if cell.inputs != inputs:
-            raise InvalidFileError(path, "inputs", "those that its name is the hash of", digest(cell.inputs))
-        if len(cell.M1) != inputs.instances:
-            raise InvalidFileError(path, "M1", f"{inputs.instances} numbers", len(cell.M1))
-        return cell
-
-    def write(self, cell: Cell) -> Path:
-        """Keep a cell, whole or not at all; its path."""
-        path = self.path(cell.inputs)
-        write_json(path, msgspec.to_builtins(cell))
-        return path
 
 
 def make(job: Job) -> list[Cell]:
@@ -222,6 +189,7 @@ def _play(inputs: Play, weights: Path | None, besides: Sequence[Play]) -> list[C
             training=training,
             seconds=round(scores.seconds, 1),
             revision=revision,
+            kernels=sources_digest(),
         )
         for wanted in (inputs, *besides)
         for m1 in (scores.measures[wanted.objective],)
@@ -243,6 +211,7 @@ def _prove(inputs: Bound) -> Cell:
         needs="failure model and clock",
         seconds=round(time.perf_counter() - started, 1),
         revision=source_revision(),
+        kernels=sources_digest(),
     )
 
 

@@ -17,14 +17,12 @@ from importlib.util import find_spec
 
 from marl_sched.errors import MarlSchedError
 from marl_sched.train.malloc import keep_freed_memory
-from marl_sched.train.published.cells import Cell, Cells, Job, describe, make
+from marl_sched.train.published.cells import Cell, Job, describe, make
+from marl_sched.train.published.store import Cells
 
 
 def missing(jobs: Iterable[Job], cells: Cells) -> list[Job]:
-    """What is left of the jobs, in their order: cells that are there are not made again.
-
-    Raises InvalidFileError for a damaged cell.
-    """
+    """What is left of the jobs, in their order: cells that are there are not made again."""
     return [left for job in jobs if (left := _left(job, cells)) is not None]
 
 
@@ -53,8 +51,7 @@ def fill(jobs: Iterable[Job], cells: Cells, pool: Executor) -> Iterator[tuple[Jo
                 f"were finished are kept"
             ) from error
         left -= 1
-        for cell in made:
-            cells.write(cell)
+        cells.write(*made)
         yield futures[future], made[0]
 
 

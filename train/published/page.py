@@ -12,11 +12,11 @@ from typing import Any
 from marl_sched.files import replacing, write_json
 from marl_sched.train.evaluation.evaluate import LOCAL_SHARE
 from marl_sched.train.evaluation.plots import save
-from marl_sched.train.published.cells import Cells
 from marl_sched.train.published.entries import Entries
 from marl_sched.train.published.picture import price_of_decentralisation
 from marl_sched.train.published.remarks import reading_aid
 from marl_sched.train.published.results import Results
+from marl_sched.train.published.store import Cells
 
 PICTURE = "price-of-decentralisation.png"
 _NONE = "-"
@@ -33,7 +33,7 @@ def page(results: Mapping[str, Any]) -> str:
     for objective, table in results["objectives"].items():
         parts += [f"## {objective.capitalize()}", _published_layout(table), reading_aid(table)]
         parts.append(_against_limits(table, results["episodes"]))
-    parts += [*_decentralisation(results), *_learned(results), *_untrained(results)]
+    parts += [*_decentralisation(results), *_learned(results), *_untrained(results), *_made_by(results)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -254,6 +254,15 @@ def _difference(difference: Mapping[str, Any]) -> str:
 def _markdown(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     lines = [heads, ["---"] + ["---:"] * (len(heads) - 1), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _made_by(results: Mapping[str, Any]) -> Iterator[str]:
+    """Which revisions of the source made the cells."""
+    told = ", ".join(f"`{name[:12] or 'unknown'}` ({count})" for name, count in results["revisions"].items())
+    yield (
+        f"The cells were made at these revisions of the source, how many at each in brackets: {told}. A sample of them "
+        "is played again before cells of other kernels are added."
+    )
 
 
 def write_pages(entries: Entries, cells: Cells, command: str, folder: Path) -> list[Path]:

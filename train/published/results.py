@@ -16,11 +16,12 @@ import numpy as np
 
 from marl_sched.errors import MarlSchedError
 from marl_sched.statistics import CONFIDENCE, holm, paired_difference, percent_gain, summarise
-from marl_sched.train.published.cells import Cell, Cells, Job, describe, digest
+from marl_sched.train.published.cells import Cell, Job, describe, digest
 from marl_sched.train.published.entries import Entries, Untrained
 from marl_sched.train.published.plan import Line, Row
+from marl_sched.train.published.store import Cells
 
-SCHEMA = 2  # 1 named the horizon by its unit, as `hours`
+SCHEMA = 3  # 1 named the horizon by its unit, 2 had no revisions
 FAILURE_MODEL = "failure model"  # in a scheduler's `needs`
 
 
@@ -53,6 +54,7 @@ class Results:
             "reference": self._reference_row().label,
             "objectives": tables,
             "decentralisation": self._decentralisation(),
+            "revisions": self._cells.revisions(),
             "untrained": [vars(entry) for entry in self._entries.all()[1]],
         }
         return _rounded(data)
@@ -209,7 +211,7 @@ class Results:
         cell = self._cells.read(job.inputs)
         if cell is None:
             raise MarlSchedError(
-                f"{self._cells.path(job.inputs)}: there is no cell for {describe(job.inputs)}; "
+                f"{self._cells.path}: there is no cell for {describe(job.inputs)}; "
                 f"make what is missing with `{self._command}`"
             )
         return cell

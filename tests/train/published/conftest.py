@@ -6,9 +6,10 @@ import pytest
 
 from marl_sched.agents.policies.cards import write_card
 from marl_sched.agents.registry import shipped_policies
-from marl_sched.train.published.cells import Bound, Cell, Cells, Training
+from marl_sched.train.published.cells import Bound, Cell, Training
 from marl_sched.train.published.entries import Entries
 from marl_sched.train.published.plan import as_plan
+from marl_sched.train.published.store import Cells
 
 LOCAL = {"kind": "local", "reach": 1, "comm": 1, "staleness": 0}
 SIZE = {"instances": 2, "episodes": 2, "bound": {"price_vectors": 1, "evaluations": 1}}
@@ -74,7 +75,7 @@ def entries(plan, tmp_path):
 
 @pytest.fixture
 def cells(tmp_path):
-    return Cells(tmp_path / "cells")
+    return Cells(tmp_path / "cells" / "cells.jsonl")
 
 
 @pytest.fixture

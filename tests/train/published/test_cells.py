@@ -21,9 +21,10 @@ from marl_sched.errors import InvalidFileError, MarlSchedError
 from marl_sched.problem import Problem
 from marl_sched.train.evaluation.evaluate import evaluate_scheduler
 from marl_sched.train.published import filling
-from marl_sched.train.published.cells import Bound, Cell, Job, Play, digest, make
+from marl_sched.train.published.cells import Bound, Cell, Job, Play, describe, digest, make
 from marl_sched.train.published.entries import Entries
 from marl_sched.train.published.filling import fill, missing, worker_processes
+from marl_sched.train.published.store import Cells, confirm
 
 AIRME = get_domain("airme")
 PLAY = Play(
@@ -108,10 +109,9 @@ def test_a_proved_cell_is_not_below_the_bound():
 
 def test_what_is_written_is_read_and_says_its_inputs_in_clear(cells):
     cell = Cell(inputs=PLAY, M1=[0.25, 0.5], episode_std=0.1, visible_share=0.4, seconds=1.0, revision="abc")
-    path = cells.write(cell)
-    assert path == cells.folder / f"{digest(PLAY)}.json"
-    assert cells.read(PLAY) == cell
-    assert json.loads(path.read_text())["inputs"]["scheduler"] == "condition"
+    cells.write(cell)
+    assert Cells(cells.path).read(PLAY) == cell
+    assert json.loads(cells.path.read_text())["inputs"]["scheduler"] == "condition"
     assert cells.read(BOUND) is None
 
 
@@ -121,15 +121,54 @@ def test_what_is_written_is_read_and_says_its_inputs_in_clear(cells):
         ({"M1": [0.5]}, "M1: expected 2 numbers"),
         ({"M1": ["high", 0.5]}, "a cell of schema 1"),
         ({"surplus": 1}, "a cell of schema 1"),
-        ({"inputs": msgspec.to_builtins(msgspec.structs.replace(PLAY, seed=6))}, "its name is the hash of"),
     ],
 )
 def test_a_damaged_cell_is_refused_by_name(cells, change, message):
-    path = cells.write(Cell(inputs=PLAY, M1=[0.25, 0.5], seconds=1.0, revision=""))
-    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
+    cells.write(Cell(inputs=PLAY, M1=[0.25, 0.5], seconds=1.0, revision=""))
+    cells.path.write_text(json.dumps({**json.loads(cells.path.read_text()), **change}))
     with pytest.raises(InvalidFileError, match=message) as refused:
-        cells.read(PLAY)
-    assert str(path) in str(refused.value)
+        Cells(cells.path)
+    assert f"{cells.path}: line 1" in str(refused.value)
+
+
+def test_a_cell_that_stands_twice_is_refused(cells):
+    cells.write(Cell(inputs=PLAY, M1=[0.25, 0.5], seconds=1.0, revision=""))
+    cells.path.write_bytes(2 * cells.path.read_bytes())
+    with pytest.raises(InvalidFileError, match="line 2"):
+        Cells(cells.path)
+
+
+def test_cells_that_two_processes_write_are_both_kept(cells):
+    other = Cells(cells.path)
+    cells.write(Cell(inputs=PLAY, M1=[0.25, 0.5], seconds=1.0, revision=""))
+    other.write(Cell(inputs=BOUND, M1=[0.5, 0.75], seconds=1.0, revision=""))
+    assert len(Cells(cells.path)) == 2
+
+
+def test_lines_are_sorted_so_that_a_new_cell_is_one_line_of_a_difference(cells):
+    inputs = [msgspec.structs.replace(PLAY, seed=seed) for seed in range(20)]
+    for one in inputs:
+        cells.write(Cell(inputs=one, M1=[0.25, 0.5], seconds=1.0, revision=""))
+    names = [digest(msgspec.json.decode(line, type=Cell).inputs) for line in cells.path.read_bytes().splitlines()]
+    assert names == sorted(digest(one) for one in inputs)
+
+
+def test_cells_of_other_kernels_are_taken_over_where_a_sample_agrees(cells):
+    (made,) = make(Job(PLAY))
+    cells.write(msgspec.structs.replace(made, kernels="earlier"))
+    cells.write(Cell(inputs=BOUND, M1=[0.5, 0.75], seconds=1.0, revision="", kernels=None))
+    assert len(cells.stale()) == 2
+    assert confirm(cells, [Job(PLAY), Job(BOUND)], 10) == []
+    assert cells.stale() == []
+    assert cells.read(PLAY) == made
+
+
+def test_cells_of_kernels_that_score_otherwise_are_made_again(cells):
+    (made,) = make(Job(PLAY))
+    cells.write(msgspec.structs.replace(made, kernels="earlier", M1=[made.M1[0] + 1e-6, made.M1[1]]))
+    cells.write(Cell(inputs=BOUND, M1=[0.5, 0.75], seconds=1.0, revision="", kernels=None))
+    assert confirm(cells, [Job(PLAY), Job(BOUND)], 10) == [describe(PLAY)]
+    assert len(cells) == 0
 
 
 def test_weights_that_change_make_another_cell(entries, plan, trained, tmp_path):
@@ -201,7 +240,7 @@ def test_a_run_that_was_stopped_goes_on_where_it_was(entries, cells, monkeypatch
     monkeypatch.setattr(filling, "make", stop_at_the_fourth)
     with ThreadPoolExecutor(1) as pool, pytest.raises(KeyboardInterrupt):
         list(fill(jobs[:4], cells, pool))
-    kept = {path.stem for path in cells.folder.iterdir()}
+    kept = {digest(cell.inputs) for cell in Cells(cells.path)}
     assert kept >= set(made)
     assert len(made) == 3
     assert missing(jobs, cells) == [job for job in jobs if digest(job.inputs) not in made]
@@ -222,9 +261,9 @@ def test_an_objective_that_comes_later_does_not_touch_the_cells_of_the_others(en
         if isinstance(job.inputs, Play) and job.inputs.scheduler == "condition" and job.inputs.scale == "medium"
     ]
     (revenue,) = job.besides
-    cells.path(revenue).unlink()
+    cells.remove(revenue)
     assert missing(entries.all()[0], cells) == [Job(revenue)]
-    cells.path(job.inputs).unlink()
+    cells.remove(job.inputs)
     assert missing(entries.all()[0], cells) == [job]
 
 
@@ -235,7 +274,7 @@ def test_what_cannot_be_made_is_told_by_the_workers_in_full(entries, cells, plan
     told = r"net-profit.*, small, .*: .*net-profit\.safetensors: expected the weights that were there"
     with worker_processes(1) as pool, pytest.raises(MarlSchedError, match=told):
         list(fill([job], cells, pool))
-    assert not cells.folder.exists()
+    assert not cells.path.exists()
 
 
 def gone(pid: int) -> bool:

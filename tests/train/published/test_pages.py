@@ -9,11 +9,11 @@ from scipy import stats
 
 from marl_sched.errors import InvalidFileError, MarlSchedError
 from marl_sched.train.config import load_config
-from marl_sched.train.published.cells import Cells
 from marl_sched.train.published.entries import Entries
 from marl_sched.train.published.page import page, write_pages
 from marl_sched.train.published.plan import as_plan, load_plan
 from marl_sched.train.published.results import Results
+from marl_sched.train.published.store import Cells
 
 ROOT = Path(__file__).resolve().parents[3]
 RESULTS = ROOT / "docs" / "results"
@@ -159,11 +159,10 @@ def test_a_quick_page_says_so(plan, cells, trained, write, tmp_path):
 
 def test_a_missing_cell_is_named_with_the_command_and_nothing_is_written(entries, cells, write, tmp_path):
     write(entries, cells)
-    gone = sorted(cells.folder.iterdir())[0]
-    gone.unlink()
+    cells.remove(entries.all()[0][0].inputs)
     with pytest.raises(MarlSchedError, match="make what is missing with `marl-sched tables --env airme`") as told:
         write_pages(entries, cells, "marl-sched tables --env airme", tmp_path / "page")
-    assert gone.stem in str(told.value)
+    assert str(cells.path) in str(told.value)
     assert not (tmp_path / "page").exists()
 
 
@@ -242,6 +241,6 @@ def test_the_committed_page_is_what_the_committed_cells_give(path, tmp_path):
     plan = load_plan(path.stem)
     entries = Entries(plan, plan.full, ROOT)
     command = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))["command"]
-    write_pages(entries, Cells(RESULTS / path.stem), command, tmp_path)
+    write_pages(entries, Cells(RESULTS / path.stem / "cells.jsonl"), command, tmp_path)
     for name in (f"{path.stem}.json", f"{path.stem}.md"):
         assert (tmp_path / name).read_bytes() == (RESULTS / name).read_bytes(), f"{name}: draw it again"
