@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from marl_sched.comms.messages import run_prefix
 from marl_sched.domain import Domain, Telemetry, get_domain
+from marl_sched.envs import DOMAINS
 from marl_sched.errors import InvalidOptionError, require
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ class WorldOptions:
         report: file for the JSON report; "" writes none.
     """
 
-    env: str = "airme"
+    env: str = next(iter(DOMAINS))
     scale: str = "small"
     instance: str = ""
     seed: int = 0

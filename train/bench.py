@@ -30,24 +30,28 @@ _TORCHRL_STEPS = 100
 _POLICY_DECISIONS = 200
 _MEANINGS = {
     "aec_turns_per_s": "AEC turns with observations, small instance, random legal choices: last() and step()",
-    "torchrl_decisions_per_s": f"decisions of a TorchRL batch of {BATCH} small instances with full observations, "
+    "torchrl_decisions_per_s": "decisions of a TorchRL batch of small instances with full observations, "
     "random legal choices: rand_action() and step_and_maybe_reset()",
     "policy_ms": "one decision of the default HetGAT policy at batch size 1 with a full view, observing included",
 }
 
 
-def bench(domain: Domain, *, repeats: int = 5) -> dict[str, Any]:
-    """All figures of a domain, ready for JSON; `meaning` says what each of them is of. Uses one thread."""
+def bench(domain: Domain, *, repeats: int = 5, batch: int | None = None) -> dict[str, Any]:
+    """All figures of a domain, ready for JSON; `meaning` says what each of them is of. Uses one thread.
+
+    `batch`: envs of what is measured in batches, None: BATCH; fewer for a simulator that is not compiled.
+    """
+    batch = BATCH if batch is None else batch
     if repeats < 1:
         raise InvalidOptionError(f"repeats: expected an integer >= 1, got {repeats}")
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        own = own_benchmarks(domain, BATCH)
+        own = own_benchmarks(domain, batch)
         figures = {
             **{name: each.per_second * _best(repeats, each.prepare, each.play) for name, each in own.items()},
             "aec_turns_per_s": aec_turns_per_second(domain, repeats),
-            "torchrl_decisions_per_s": torchrl_decisions_per_second(domain, repeats),
+            "torchrl_decisions_per_s": torchrl_decisions_per_second(domain, repeats, batch),
             "policy_ms": {scale: policy_milliseconds(domain, scale, repeats) for scale in _scales(domain)},
         }
     finally:
@@ -57,6 +61,7 @@ def bench(domain: Domain, *, repeats: int = 5) -> dict[str, Any]:
         "env": domain.name,
         "threads": 1,
         "repeats": repeats,
+        "batch": batch,
         "statistic": "best of repeats, CPU time",
     }
     return {**head, **figures, "meaning": {**{name: each.meaning for name, each in own.items()}, **_MEANINGS}}
@@ -85,16 +90,16 @@ def aec_turns_per_second(domain: Domain, repeats: int) -> float:
     return _AEC_TURNS / _best(repeats, lambda: env.reset(seed=0), play)
 
 
-def torchrl_decisions_per_second(domain: Domain, repeats: int) -> float:
+def torchrl_decisions_per_second(domain: Domain, repeats: int, batch: int) -> float:
     """Decisions per second of a TorchRL batch that is stepped without storing a rollout."""
-    env = SchedulingTorchRL(domain, batch_size=BATCH, scale=_scales(domain)[0])
+    env = SchedulingTorchRL(domain, batch_size=batch, scale=_scales(domain)[0])
     state = {"now": env.reset()}
 
     def play() -> None:
         for _ in range(_TORCHRL_STEPS):
             _, state["now"] = env.step_and_maybe_reset(env.rand_action(state["now"]))
 
-    return BATCH * _TORCHRL_STEPS / _best(repeats, lambda: None, play)
+    return batch * _TORCHRL_STEPS / _best(repeats, lambda: None, play)
 
 
 def policy_milliseconds(domain: Domain, scale: str, repeats: int) -> float:

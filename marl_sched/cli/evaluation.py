@@ -104,6 +104,9 @@ def bench(
     env: options.Env = options.DEFAULT_ENV,
     json: options.JsonFile = None,
     repeats: Annotated[int, typer.Option("--repeats", min=1, help="Measurements; the best is reported.")] = 5,
+    batch: Annotated[
+        int | None, typer.Option("--batch", min=1, help="Envs of what is measured in batches (default 1024).")
+    ] = None,
 ) -> None:
     """Measure how fast the simulator, its environment APIs and the policy are on this machine, on one thread."""
     from marl_sched.cli.tables import print_bench
@@ -112,7 +115,7 @@ def bench(
     from marl_sched.train.bench import bench as measure
 
     options.check_output(json)
-    figures = measure(get_domain(env), repeats=repeats)
+    figures = measure(get_domain(env), repeats=repeats, batch=batch)
     if json is not None:
         write_json(json, figures)
     print_bench(figures)

@@ -122,7 +122,7 @@ def _in_one_process(policy, seed):
 
 @pytest.mark.slow
 def test_it_is_measured(run, tmp_path):
-    ended = run("bench", "--env", "couriers", "--repeats", 1, "--json", tmp_path / "bench.json")
+    ended = run("bench", "--env", "couriers", "--repeats", 1, "--batch", 4, "--json", tmp_path / "bench.json")
     assert ended.code == 0, ended.err
     assert set(json.loads((tmp_path / "bench.json").read_text())["policy_ms"]) == {"town", "city"}
 

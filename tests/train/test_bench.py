@@ -25,7 +25,7 @@ def test_the_figures_have_the_names_that_other_tools_read_and_say_what_they_are_
     threads = torch.get_num_threads()
     figures = bench.bench(AIRME, repeats=1)
     names = {"hour_us_b1", "hour_us_b3", "aec_turns_per_s", "torchrl_decisions_per_s", "policy_ms"}
-    assert set(figures) == names | {"schema", "env", "threads", "repeats", "statistic", "meaning"}
+    assert set(figures) == names | {"schema", "env", "threads", "repeats", "batch", "statistic", "meaning"}
     assert set(figures["policy_ms"]) == {"small", "large"}
     assert set(figures["meaning"]) == names
     assert all(value > 0 for value in (*figures["policy_ms"].values(), *(figures[n] for n in names - {"policy_ms"})))

@@ -1,0 +1,51 @@
+"""Rooms that serve every domain name none: only their registration does, and examples in docstrings."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+from marl_sched.envs import DOMAINS
+
+ROOT = Path(__file__).resolve().parents[2]
+GENERIC = ("marl_sched", "envs/api", "train", "comms")
+# Public modules of one domain, and the files that register it.
+REGISTRATION = {"marl_sched/__init__.py", "marl_sched/gymnasium_ids.py"}
+FILES = sorted(
+    path
+    for room in GENERIC
+    for path in (ROOT / room).rglob("*.py")
+    if str(path.relative_to(ROOT)) not in REGISTRATION
+    and not path.name.startswith(tuple(f"{name}_v" for name in DOMAINS))
+)
+NAMES = re.compile("|".join(DOMAINS), re.IGNORECASE)
+
+
+def named(source: str) -> list[str]:
+    """Words of a module's code that name a domain; docstrings and comments are none."""
+    tree = ast.parse(source)
+    docstrings = {
+        id(node.body[0].value)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
+        and node.body
+        and isinstance(node.body[0], ast.Expr)
+    }
+    words = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings:
+            words.append(node.value)
+        words += [getattr(node, field) for field in ("id", "attr", "name", "module", "arg") if hasattr(node, field)]
+    return [word for word in words if isinstance(word, str) and NAMES.search(word)]
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_no_domain_is_named_in_code_that_serves_all(path):
+    assert named(path.read_text(encoding="utf-8")) == []
+
+
+def test_a_name_in_code_would_be_seen_and_one_in_a_docstring_not():
+    first = next(iter(DOMAINS))
+    assert named(f'"""Like {first}."""\nenv = \'{first}\'\n') == [first]
+    assert named(f"import marl_sched.envs.{first}.views\n") == [f"marl_sched.envs.{first}.views"]
