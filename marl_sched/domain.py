@@ -17,9 +17,14 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, get_type_hints
 
 import numpy as np
 
+<<<<<<< HEAD
 from marl_sched.errors import InvalidOptionError, MarlSchedError, require
 from marl_sched.noise import as_seed
 from marl_sched.plugins import DOMAINS, import_object, load_offered, offered
+=======
+from marl_sched.errors import InvalidOptionError, require
+from marl_sched.noise import Split, instance_generator
+>>>>>>> 2c80300 (Keep train, validation and test apart in every environment API, and serve the usual tools: constant teams, flat vectors, one place for the mask, illegal choices in TorchRL idle)
 
 if TYPE_CHECKING:
     from gymnasium.spaces import Space
@@ -46,6 +51,9 @@ class CentralInterface(Protocol):
 
     def action_space(self, simulator: Any) -> Space[Any]:
         """The space of a joint action."""
+
+    def action_masks(self, simulator: Any) -> np.ndarray:
+        """Which values each part of a joint action may take in row 0, bool, one part's values after the other's."""
 
     def play(self, simulator: Any, action: Any) -> tuple[float, dict[str, Any]]:
         """Take all turns that a joint action covers in row 0; the reward it brought and the step's infos."""
@@ -202,14 +210,13 @@ class Domain:
         """`crew_3` for agent 3 of a domain whose agents are crews."""
         return f"{self.agent_prefix}_{agent}"
 
-    def instances(self, scale: str, count: int, seed: int) -> list[Any]:
-        """`count` instances of a scale; instance i depends on (seed, i) alone.
+    def instances(self, scale: str, count: int, seed: int, split: Split = "test") -> list[Any]:
+        """`count` instances of a scale; instance i depends on (seed, split, i) alone (marl_sched.noise).
 
-        Raises UnknownNameError for the scale, InvalidOptionError for a seed outside [0, 2**63).
+        Raises UnknownNameError for the scale or the split, InvalidOptionError for a seed outside [0, 2**63).
         """
         self.require_scale(scale)
-        seed = as_seed(seed)
-        return [self.generate(scale, np.random.default_rng([seed, i])) for i in range(count)]
+        return [self.generate(scale, instance_generator(seed, i, split)) for i in range(count)]
 
     def require_scale(self, scale: str) -> str:
         """The scale's name, or UnknownNameError."""

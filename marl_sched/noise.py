@@ -11,7 +11,12 @@ The name is absorbed in two steps, because a simulator reuses the first for thou
     time_word = time_key(episode_key(seed, instance, episode), time)
     u = uniform(time_word, stream, entity, draw)
 
-All functions are compiled and may be called from Python or from other kernels. Called from Python, a key
+Seeds number problems within a split, and splits never meet: instance i of seed s is another one in "train", in
+"validation" and in "test", and so is the noise of its episodes. `marl-sched evaluate`, `compare` and deployments play
+"test", whose instance i of seed s is drawn by `numpy.random.default_rng([s, i])`; environments are made for learning
+and play "train" unless told otherwise.
+
+The compiled functions may be called from Python or from other kernels. Called from Python, a key
 comes back as a plain int: pass it on as `np.uint64(key)`, since Numba takes plain ints for signed. Streams below
 `FIRST_DOMAIN_STREAM` are shared by all domains; a domain numbers its own from there on.
 """
@@ -19,12 +24,20 @@ comes back as a plain int: pass it on as `np.uint64(key)`, since Numba takes pla
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
+<<<<<<< HEAD
 from marl_sched.errors import require_integer
 from marl_sched.kernels import kernel
+=======
+from marl_sched.errors import require, require_integer
+
+Split = Literal["train", "validation", "test"]
+SPLITS: dict[str, int] = {"test": 0, "train": 1, "validation": 2}
+_EPISODES_OF_A_SPLIT = 48  # bits: an episode's number within its split is below 2**48
+>>>>>>> 2c80300 (Keep train, validation and test apart in every environment API, and serve the usual tools: constant teams, flat vectors, one place for the mask, illegal choices in TorchRL idle)
 
 FIRST_DOMAIN_STREAM = 16
 
@@ -48,7 +61,35 @@ def as_seed(seed: Any) -> int:
     return require_integer("seed", seed, 0, 2**63 - 1)
 
 
+<<<<<<< HEAD
 @kernel(inline="always")
+=======
+def fresh_seed() -> int:
+    """A seed in [0, 2**63) from the operating system's entropy, for environments that were given none."""
+    return int(np.random.SeedSequence().generate_state(1, np.uint64)[0] >> np.uint64(1))
+
+
+def instance_generator(seed: Any, index: int, split: Split = "test") -> np.random.Generator:
+    """What instance `index` of a seed is drawn with, another one in every split.
+
+    The word of the split stands behind four words that hold seed and index, and "test" has none, so that no seed
+    and index of one split can be those of another. Raises UnknownNameError for the split, InvalidOptionError for
+    the seed.
+    """
+    word = SPLITS[require("split", split, SPLITS)]
+    return np.random.default_rng(np.random.SeedSequence([as_seed(seed), index], spawn_key=(word,) if word else ()))
+
+
+def episode_number(episode: int, split: Split = "test") -> int:
+    """The number by which a split's episode is known to the noise: no two splits share one.
+
+    With it a fixed instance, which is the same in all splits, still meets other noise in each of them.
+    """
+    return episode + (SPLITS[require("split", split, SPLITS)] << _EPISODES_OF_A_SPLIT)
+
+
+@njit(cache=True, inline="always")
+>>>>>>> 2c80300 (Keep train, validation and test apart in every environment API, and serve the usual tools: constant teams, flat vectors, one place for the mask, illegal choices in TorchRL idle)
 def mix(x: np.uint64) -> np.uint64:
     """The finaliser of SplitMix64, a bijection of 64-bit words in which every input bit moves every output bit."""
     x = (x ^ (x >> _S30)) * _MIX_1

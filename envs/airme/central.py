@@ -26,6 +26,15 @@ class HourlyDecisions:
         """`MultiDiscrete([P + 1] * C)`, padded like the simulator."""
         return spaces.MultiDiscrete(np.full(simulator.max_agents, simulator.max_actions))
 
+    def action_masks(self, simulator: AirmeSimulator) -> np.ndarray:
+        """For each crew the planes that nobody repairs, and 0; 0 alone for a crew that is busy. Bool (C (P + 1),)."""
+        masks = np.zeros((simulator.max_agents, simulator.max_actions), bool)
+        slots = np.arange(simulator.max_actions)
+        unattended = (slots <= simulator.state.rows["n_planes"][0]) & (simulator.state.planes["crew"][0] < 0)
+        masks[simulator.free_agents(0)] = unattended
+        masks[:, IDLE] = True
+        return masks.ravel()
+
     def play(self, simulator: AirmeSimulator, action: Any) -> tuple[float, dict[str, Any]]:
         """Play one hour of row 0; the reward of the hour, and which crews idled for an impossible action."""
         choices = np.full(simulator.max_agents, IDLE, np.int64)

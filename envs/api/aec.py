@@ -13,7 +13,7 @@ from marl_sched.graph import ACTION_MASK, VISIBLE_SHARE
 from marl_sched.simulation import Observation
 
 
-class SchedulingAEC(SchedulingEnvironment, AECEnv):
+class SchedulingAEC(SchedulingEnvironment, AECEnv[str, Any, int]):
     """A domain as a PettingZoo AEC environment.
 
     Only agents with a decision to make are ever selected, `agents` stays the same until all end together, and
@@ -41,7 +41,7 @@ class SchedulingAEC(SchedulingEnvironment, AECEnv):
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
         """Start episode 0 of `seed`, or the next episode; `options={"instance": ...}` gives its instance."""
         self._single.reset(seed, options)
-        self.agents = self.possible_agents[: self.simulator.n_agents[0]]
+        self.agents = self._present()
         self._index = {agent: i for i, agent in enumerate(self.agents)}
         self.rewards = dict.fromkeys(self.agents, 0.0)
         self._cumulative_rewards = dict.fromkeys(self.agents, 0.0)
@@ -57,21 +57,22 @@ class SchedulingAEC(SchedulingEnvironment, AECEnv):
         """Select the acting agent and look through its eyes."""
         self._acting = acting = int(self.simulator.acting[0])
         agent = self.agent_selection = self.possible_agents[acting]
-        self._seen, self.infos[agent] = self._look(acting)
-        self._legal = self._seen[ACTION_MASK].tobytes()
+        self._seen, self.infos[agent], mask = self._look(acting)
+        self._legal = mask.tobytes()
 
-    def _look(self, agent: int) -> tuple[dict[str, Any], dict[str, Any]]:
+    def _look(self, agent: int) -> tuple[Any, dict[str, Any], np.ndarray]:
+        """An agent's observation, info and mask."""
         seen: Observation = self._single.observe(agent)
         mask = seen.pop(ACTION_MASK)
         info = {
-            ACTION_MASK: mask,
+            **self.layout.info(mask),
             "conflict": self._conflict[agent],
             "time": int(self.simulator.time[0]),
             VISIBLE_SHARE: float(seen[VISIBLE_SHARE]),
         }
-        return {"observation": seen, ACTION_MASK: mask}, info
+        return self.layout.observation(seen, mask), info, mask
 
-    def observe(self, agent: str) -> dict[str, Any]:
+    def observe(self, agent: str) -> Any:
         """What an agent of this instance sees now; one that has no turn may do nothing but action 0."""
         if agent not in self._index:
             raise UnknownNameError("agent", agent, self._index)

@@ -9,8 +9,9 @@ from gymnasium import spaces
 
 from marl_sched.domain import Domain
 from marl_sched.envs.api.episode import SingleEpisode
+from marl_sched.envs.api.layout import Layout, MaskPlace
 from marl_sched.envs.api.saving import SavesState
-from marl_sched.envs.api.spaces import action_space, graph_space, observation_space
+from marl_sched.envs.api.spaces import action_space, graph_space
 from marl_sched.errors import InvalidOptionError, UnknownNameError
 
 
@@ -19,6 +20,10 @@ class SchedulingEnvironment(SavesState):
 
     Args:
         domain: a registered domain or its name.
+        flat, mask: how observations and infos are laid out (marl_sched.envs.api.layout); the default is a Dict of
+            the graph's arrays with the mask in observation and info.
+        pad_agents: whether `agents` are always all possible ones, for tools that need a constant team; those that
+            an instance does not have see nothing, can only do nothing and never have a turn.
         options: as SingleEpisode takes them, its `render_mode` included.
 
     Raises InvalidOptionError for a `scheme`: every free agent has its turn here.
@@ -27,7 +32,15 @@ class SchedulingEnvironment(SavesState):
     possible_agents: list[str]
     agents: list[str]
 
-    def __init__(self, domain: str | Domain, **options: Any) -> None:
+    def __init__(
+        self,
+        domain: str | Domain,
+        *,
+        flat: bool = False,
+        mask: MaskPlace = "both",
+        pad_agents: bool = False,
+        **options: Any,
+    ) -> None:
         super().__init__()
         if "scheme" in options:
             raise InvalidOptionError(
@@ -37,13 +50,18 @@ class SchedulingEnvironment(SavesState):
         self.metadata, self.render_mode = self._single.metadata, self._single.render_mode
         simulator = self.simulator = self._single.simulator
         self.possible_agents = [self._single.domain.agent_name(i) for i in range(simulator.max_agents)]
-        self._observation_spaces = {agent: observation_space(simulator) for agent in self.possible_agents}
+        self.layout, self._pad_agents = Layout(simulator.arrays, flat=flat, mask=mask), pad_agents
+        self._observation_spaces = {agent: self.layout.space() for agent in self.possible_agents}
         self._action_spaces = {agent: action_space(simulator) for agent in self.possible_agents}
         self.state_space = graph_space(simulator.arrays)
         self.agents = []
 
+    def _present(self) -> list[str]:
+        """The agents of an episode that begins now."""
+        return self.possible_agents[: None if self._pad_agents else self.simulator.n_agents[0]]
+
     def observation_space(self, agent: str) -> spaces.Space:
-        """`Dict(observation=Dict(...), action_mask=Box)`, padded to the scale's largest instance.
+        """`Dict(observation=Dict(...), action_mask=Box)` or as the layout says, padded to the scale's largest instance.
 
         Raises UnknownNameError for an agent that is not possible here.
         """

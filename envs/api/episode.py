@@ -12,7 +12,7 @@ from marl_sched.domain import Domain
 from marl_sched.envs.api.options import as_domain, as_instance
 from marl_sched.errors import IllegalActionError, InvalidOptionError, require
 from marl_sched.graph import ACTION_MASK
-from marl_sched.noise import as_seed
+from marl_sched.noise import Split, as_seed, episode_number, fresh_seed, instance_generator
 from marl_sched.simulation import Observation
 
 # PettingZoo's conformance kit passes {"options": 1} to every reset and expects to be heard out.
@@ -22,15 +22,18 @@ _KNOWN_OPTIONS = ("instance", "options")
 class SingleEpisode:
     """A simulator of one row and the rule by which its episodes follow each other.
 
-    Without a fixed instance episode e of seed s plays the instance drawn by `default_rng([s, e])`; with one,
-    every episode plays it with the noise of episode e. A reset with a seed starts that seed's episode 0, one
-    without goes on to the next episode.
+    Without a fixed instance episode e of seed s plays instance e of seed s in its split (marl_sched.noise); with
+    one, every episode plays it with the noise of episode e. A reset with a seed starts that seed's episode 0, one
+    without goes on to the next episode. By default that is the split "train", whose instances and noise
+    `marl-sched evaluate` never meets; `split="test"` plays what it plays.
 
     Args:
         domain: a registered domain or its name.
         scale: of generated instances, and whose largest instance sets the padding; None pads to `instance`.
         instance: a fixed instance or the path of its file.
-        view, objective, horizon, seed: as every domain's simulator takes them; None is the domain's default.
+        view, objective, horizon: as every domain's simulator takes them; None is the domain's default.
+        seed: of instances and noise until a reset gives another; None draws one from the operating system's entropy.
+        split: "train", "validation" or "test".
         render_mode: one of the domain's, or None.
         options: further options of the domain's simulator; unknown ones raise TypeError.
 
@@ -49,7 +52,8 @@ class SingleEpisode:
         view: Any = None,
         objective: str | None = None,
         horizon: int | None = None,
-        seed: int = 0,
+        seed: int | None = None,
+        split: Split = "train",
         render_mode: str | None = None,
         **options: Any,
     ) -> None:
@@ -67,7 +71,8 @@ class SingleEpisode:
             "is_parallelizable": False,
         }
         self._fixed = None if instance is None else as_instance(self.domain, instance)
-        self.position = as_seed(seed), -1
+        self.split = split
+        self.position = (fresh_seed() if seed is None else as_seed(seed)), -1
         self.simulator = self.domain.simulator(
             [self._instance(0)],
             view=self.domain.make_view(view),
@@ -86,7 +91,7 @@ class SingleEpisode:
     def _instance(self, episode: int) -> Any:
         if self._fixed is not None:
             return self._fixed
-        return self.domain.generate(str(self.scale), np.random.default_rng([self.position[0], episode]))
+        return self.domain.generate(str(self.scale), instance_generator(self.position[0], episode, self.split))
 
     def reset(self, seed: int | None, options: Mapping[str, Any] | None) -> None:
         """Start the next episode, or episode 0 of `seed`.
@@ -101,7 +106,7 @@ class SingleEpisode:
         self.position = (as_seed(seed), 0) if seed is not None else (self.position[0], self.position[1] + 1)
         seed, episode = self.position
         instance = self._instance(episode) if given is None else given
-        self.simulator.reset(seed=seed, instances=[instance], episodes=[episode])
+        self.simulator.reset(seed=seed, instances=[instance], episodes=[episode_number(episode, self.split)])
 
     @property
     def over(self) -> bool:
@@ -109,9 +114,12 @@ class SingleEpisode:
         return bool(self.simulator.terminated[0] or self.simulator.truncated[0])
 
     def observe(self, agent: int) -> Observation:
-        """The graph that an agent sees now, in fresh arrays without batch axis; after the end it may do nothing."""
+        """The graph that an agent sees now, in fresh arrays without batch axis; after the end it may do nothing.
+
+        An agent that this instance does not have sees nothing and may do nothing.
+        """
         simulator = self.simulator
-        self._agent[0] = agent
+        self._agent[0] = agent if agent < simulator.n_agents[0] else -1
         out = {name: np.empty(shape, dtype) for name, shape, dtype in self._layout}
         simulator.observe(self._agent, out)
         if simulator.acting[0] < 0:

@@ -6,13 +6,15 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium import spaces
 
 from marl_sched.domain import Domain
 from marl_sched.envs.api.episode import SingleEpisode
+from marl_sched.envs.api.layout import flattened, vector_space
 from marl_sched.envs.api.saving import SavesState
 from marl_sched.envs.api.spaces import graph_space
 from marl_sched.errors import IllegalActionError, InvalidOptionError
-from marl_sched.simulation import Observation
+from marl_sched.graph import ACTION_MASK
 
 
 class SchedulingEnv(SavesState, gymnasium.Env):
@@ -25,6 +27,8 @@ class SchedulingEnv(SavesState, gymnasium.Env):
 
     Args:
         domain: a registered domain or its name.
+        flat: whether observations are float32 vectors (all arrays but the mask, in the order of the simulator's
+            `arrays`) and joint actions one-dimensional, as Stable-Baselines3 wants both.
         options: as SingleEpisode takes them, `render_mode` and a domain's `scheme` included, but no `view`.
 
     Raises InvalidOptionError if a view is given.
@@ -35,25 +39,32 @@ class SchedulingEnv(SavesState, gymnasium.Env):
     # An instance variable to type checkers, as gymnasium.Env declares it; `make` reads it from the class.
     metadata: dict[str, Any] = {"render_modes": ["ansi", "rgb_array"], "render_fps": 10}  # noqa: RUF012
 
-    def __init__(self, domain: str | Domain, *, render_mode: str | None = None, **options: Any) -> None:
+    def __init__(
+        self, domain: str | Domain, *, render_mode: str | None = None, flat: bool = False, **options: Any
+    ) -> None:
         if "view" in options:
             raise InvalidOptionError("view: the centralised environment API sees everything; views are for agents")
         self._single = SingleEpisode(domain, render_mode=render_mode, **options)
         self.render_mode = render_mode
         self.simulator = self._single.simulator
         self.central = self._single.domain.central
-        self.observation_space = graph_space(self.simulator.arrays)
-        self.action_space = self.central.action_space(self.simulator)
+        self._joint = self.central.action_space(self.simulator)
+        self._vector = (
+            {name: spec for name, spec in self.simulator.arrays.items() if name != ACTION_MASK} if flat else {}
+        )
+        self.observation_space: spaces.Space[Any] = graph_space(self.simulator.arrays)
+        self.action_space: spaces.Space[Any] = self._joint
+        if flat:
+            self.observation_space = vector_space(self._vector)
+            self.action_space = spaces.MultiDiscrete(self._joint.nvec.ravel())
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start episode 0 of `seed`, or the next episode; `options={"instance": ...}` gives its instance."""
         super().reset(seed=seed)
         self._single.reset(seed, options)
         return self._observe(), self._info()
 
-    def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Play a joint action; its reward is the team's.
 
         Raises IllegalActionError for an action outside the space and after the end.
@@ -62,12 +73,21 @@ class SchedulingEnv(SavesState, gymnasium.Env):
             raise IllegalActionError("step: the episode is over, call reset()")
         if not self.action_space.contains(action):
             raise IllegalActionError(f"joint action: expected one in {self.action_space}, got {_shown(action)}")
-        reward, info = self.central.play(self.simulator, action)
+        reward, info = self.central.play(self.simulator, np.reshape(action, self._joint.shape))
         terminated, truncated = bool(self.simulator.terminated[0]), bool(self.simulator.truncated[0])
         return self._observe(), reward, terminated, truncated, self._info() | info
 
-    def _observe(self) -> Observation:
-        return self._single.observe(max(int(self.simulator.acting[0]), 0))
+    def action_masks(self) -> np.ndarray:
+        """Which values each part of a joint action may take, bool (sum of `nvec`,), part after part.
+
+        That is how sb3-contrib's MaskablePPO asks for it. A part whose value clashes with another part's, such as a
+        second crew for one plane, idles its agent: no mask of separate parts can exclude it.
+        """
+        return self.central.action_masks(self.simulator)
+
+    def _observe(self) -> Any:
+        graph = self._single.observe(max(int(self.simulator.acting[0]), 0))
+        return flattened(graph, self._vector) if self._vector else graph
 
     def _info(self) -> dict[str, Any]:
         return {"time": int(self.simulator.time[0])}

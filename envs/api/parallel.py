@@ -13,13 +13,13 @@ from marl_sched.errors import IllegalActionError, UnknownNameError
 from marl_sched.graph import ACTION_MASK, VISIBLE_SHARE
 from marl_sched.noise import Stream, uniforms
 
-Observations = dict[str, dict[str, Any]]
+Observations = dict[str, Any]
 Infos = dict[str, dict[str, Any]]
 
 _CONFLICT = int(Stream.CONFLICT)
 
 
-class SchedulingParallel(SchedulingEnvironment, ParallelEnv):
+class SchedulingParallel(SchedulingEnvironment, ParallelEnv[str, Any, int]):
     """A domain as a PettingZoo Parallel environment, written by hand, not converted from AEC.
 
     One step is one decision epoch: every free agent acts, and time passes until an agent is free again. Nobody sees
@@ -42,16 +42,16 @@ class SchedulingParallel(SchedulingEnvironment, ParallelEnv):
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observations, Infos]:
         """Start episode 0 of `seed`, or the next episode; `options={"instance": ...}` gives its instance."""
         self._single.reset(seed, options)
-        self.agents = self.possible_agents[: self.simulator.n_agents[0]]
+        self.agents = self._present()
         self._masks: dict[str, np.ndarray] = {}
         return self._look(set(), set())
 
-    def observe(self, agent: str) -> dict[str, Any]:
+    def observe(self, agent: str) -> Any:
         """What an agent of this instance sees now, as `step` and `reset` return it; UnknownNameError for others."""
         if agent not in self.agents:
             raise UnknownNameError("agent", agent, self.agents)
         seen = self._single.observe(self.agents.index(agent))
-        return {"observation": seen, ACTION_MASK: seen.pop(ACTION_MASK)}
+        return self.layout.observation(seen, seen.pop(ACTION_MASK))
 
     def _look(self, conflicts: set[int], illegal: set[int]) -> tuple[Observations, Infos]:
         """What every agent sees and is told; numbers of agents whose last choices failed."""
@@ -60,13 +60,14 @@ class SchedulingParallel(SchedulingEnvironment, ParallelEnv):
         for i, agent in enumerate(self.agents):
             seen = self._single.observe(i)
             mask = self._masks[agent] = seen.pop(ACTION_MASK)
-            observations[agent] = {"observation": seen, ACTION_MASK: mask.copy()}
+            share = float(seen[VISIBLE_SHARE])
+            observations[agent] = self.layout.observation(seen, mask.copy())
             infos[agent] = {
-                ACTION_MASK: mask.copy(),
+                **self.layout.info(mask.copy()),
                 "conflict": i in conflicts,
                 "illegal": i in illegal,
                 "time": int(self.simulator.time[0]),
-                VISIBLE_SHARE: float(seen[VISIBLE_SHARE]),
+                VISIBLE_SHARE: share,
             }
         return observations, infos
 

@@ -1,4 +1,4 @@
-"""Random choices among legal actions, and the refusal of others, fast enough not to be what a benchmark measures."""
+"""The refusal of choices that a mask forbids, fast enough not to be what a benchmark measures."""
 
 from __future__ import annotations
 
@@ -8,33 +8,25 @@ from marl_sched.kernels import kernel
 
 
 @kernel
-def random_legal(mask: np.ndarray, uniform: np.ndarray) -> np.ndarray:
-    """A legal action for each row, int64 (B,), each with the same probability.
+def idle_illegal(
+    mask: np.ndarray, actions: np.ndarray, acting: np.ndarray, allowed: np.ndarray, illegal: np.ndarray
+) -> int:
+    """Write the actions to `allowed`, with 0 for what the mask forbids, and say in `illegal` where that happened.
 
-    mask int8 (B, n_actions) with action 0 always legal; uniform float64 (B,) in [0, 1).
+    mask bool (B, n_actions), actions, acting and allowed int64 (B,), illegal bool (B,). Where the acting agent is
+    negative the action may be anything and becomes 0. Returns the first row with an action outside [0, n_actions),
+    -1 if there is none.
     """
-    actions = np.zeros(mask.shape[0], np.int64)
+    outside = -1
     for b in range(mask.shape[0]):
-        legal = 0
-        for action in range(mask.shape[1]):
-            legal += mask[b, action] != 0
-        left = int(uniform[b] * legal)
-        for action in range(mask.shape[1]):
-            if mask[b, action] != 0:
-                if left == 0:
-                    actions[b] = action
-                    break
-                left -= 1
-    return actions
-
-
-@kernel
-def first_illegal(mask: np.ndarray, actions: np.ndarray, acting: np.ndarray) -> int:
-    """The first row whose acting agent chose what its mask forbids or what is no action, -1 if there is none.
-
-    mask int8 (B, n_actions), actions int64 (B,), acting int64 (B,): rows with a negative agent may hold anything.
-    """
-    for b in range(mask.shape[0]):
-        if acting[b] >= 0 and not (0 <= actions[b] < mask.shape[1] and mask[b, actions[b]] != 0):
-            return b
-    return -1
+        allowed[b] = 0
+        illegal[b] = False
+        if acting[b] < 0:
+            continue
+        if not 0 <= actions[b] < mask.shape[1]:
+            outside = b if outside < 0 else outside
+        elif mask[b, actions[b]]:
+            allowed[b] = actions[b]
+        else:
+            illegal[b] = True
+    return outside

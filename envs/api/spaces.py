@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from gymnasium import spaces
 
-from marl_sched.graph import ACTION_MASK, ArraySpec
+from marl_sched.graph import ArraySpec
 from marl_sched.simulation import TurnSimulator
 
 
@@ -23,13 +23,6 @@ def array_space(spec: ArraySpec) -> spaces.Box:
 def graph_space(arrays: Mapping[str, ArraySpec]) -> spaces.Dict:
     """The Dict of all arrays of a graph, the action mask among them."""
     return spaces.Dict({name: array_space(spec) for name, spec in arrays.items()})
-
-
-def observation_space(simulator: TurnSimulator) -> spaces.Dict:
-    """`Dict(observation=Dict(all arrays but the mask), action_mask=Box int8)`, as PettingZoo knows masks."""
-    arrays = dict(simulator.arrays)
-    mask = arrays.pop(ACTION_MASK)
-    return spaces.Dict({"observation": graph_space(arrays), ACTION_MASK: array_space(mask)})
 
 
 def action_space(simulator: TurnSimulator) -> spaces.Discrete:

@@ -10,12 +10,14 @@ of the problem graph (see marl_sched.graph), and
     acting       (B,)    int64    the agent whose turn it is, -1 where the episode is over
     elapsed      (B,)    int64    simulated time that the last step let pass, the exponent of a semi-Markov discount
     conflict     (B,)    bool     the last choice was legal in its agent's view and impossible in truth
+    illegal      (B,)    bool     the last choice was one that the mask forbade, so that its agent did nothing
     reward       (B, 1)  float64  team reward of that time
     done, terminated, truncated  (B, 1) bool
 
-Random choices through `rand_action`, and so rollouts without a policy, respect the action mask. TorchRL's
-RandomPolicy samples from the action spec, which knows of no mask unless the transform ActionMask or
-`env.action_spec.update_mask` tells it.
+`action_mask` is bool here, as TorchRL's masked distributions want it. The environment keeps the mask of its action
+spec up to date, so `rollout` without a policy and `rand_action` choose legal actions, with and without the transform
+ActionMask. SerialEnv, ParallelEnv and RandomPolicy (which `Collector(env, None)` takes) sample from a copy of the spec
+that knows no mask; what they choose wrongly does nothing and is marked `illegal`.
 """
 
 from __future__ import annotations
@@ -31,11 +33,11 @@ from torchrl.envs import EnvBase
 
 from marl_sched.domain import Domain
 from marl_sched.envs.api.options import as_domain, as_instance
-from marl_sched.envs.api.sampling import first_illegal, random_legal
+from marl_sched.envs.api.sampling import idle_illegal
 from marl_sched.envs.api.saving import SavedEnvironment, SavesState
 from marl_sched.errors import IllegalActionError, InvalidOptionError
 from marl_sched.graph import ACTION_MASK, ArraySpec
-from marl_sched.noise import as_seed
+from marl_sched.noise import Split, as_seed, episode_number, fresh_seed
 
 _CPU = torch.device("cpu")
 
@@ -46,10 +48,10 @@ InstanceSource = Callable[[int, int], Any]
 class SchedulingTorchRL(SavesState, EnvBase):
     """A batch of rows of a domain as a TorchRL environment; the module's page lists the tensordict's entries.
 
-    Without `instances` and `source`, row b plays the instance drawn by `default_rng([seed, b])` in all its
-    episodes. A row's first episode is number 0, as in the Other environment APIs, and every reset goes on to the next.
-    Rows that share an instance take turns in counting, and with a source all rows do, so that no two rows
-    ever play the same episode.
+    Without `instances` and `source`, row b plays instance b of the seed and split (marl_sched.noise) in all its
+    episodes: by default "train", whose instances and noise `marl-sched evaluate` never meets. A row's first episode
+    is number 0, as in the other environment APIs, and every reset goes on to the next. Rows that share an instance
+    take turns in counting, and with a source all rows do, so that no two rows ever play the same episode.
 
     Args:
         domain: a registered domain or its name.
@@ -58,13 +60,15 @@ class SchedulingTorchRL(SavesState, EnvBase):
         instances: one per row, or files of such.
         source: gives a row's instance at each of its resets, and once more when the environment is made.
         view, objective, horizon: as every domain's simulator takes them; None is the domain's default.
-        seed: of instances, noise and random actions; `set_seed` sets another, for each row from its next reset on.
+        seed: of instances and noise; `set_seed` sets another, for each row from its next reset on. None draws one
+            from the operating system's entropy. Random actions follow `torch.manual_seed`, as everywhere in TorchRL.
+        split: "train", "validation" or "test".
         device: where tensors live; the simulator runs on the CPU.
         options: further options of the domain's simulator; unknown ones raise TypeError.
     """
 
     batch_locked = True
-    changing = ("_seed", "_rng", "_count", "_mask")
+    changing = ("_seed", "_count")
 
     def __init__(
         self,
@@ -77,7 +81,8 @@ class SchedulingTorchRL(SavesState, EnvBase):
         view: Any = None,
         objective: str | None = None,
         horizon: int | None = None,
-        seed: int = 0,
+        seed: int | None = None,
+        split: Split = "train",
         device: torch.device | str = "cpu",
         **options: Any,
     ) -> None:
@@ -88,7 +93,8 @@ class SchedulingTorchRL(SavesState, EnvBase):
         self.scale = scale if scale is None else self.domain.require_scale(scale)
         self._source = source
         self._given = None if instances is None else [as_instance(self.domain, i) for i in instances]
-        self._set_seed(seed)
+        self.split = split
+        self._set_seed(fresh_seed() if seed is None else seed)
         self.simulator = self.domain.simulator(
             self._instances(range(rows), 0),
             view=self.domain.make_view(view),
@@ -98,29 +104,42 @@ class SchedulingTorchRL(SavesState, EnvBase):
             pad=self.scale,
             **options,
         )
-        self._mask = np.zeros((rows, self.simulator.max_actions), np.int8)
+        self._mask = np.ones((rows, self.simulator.max_actions), bool)  # of the choices to be made now
+        self._allowed, self._illegal = np.zeros(rows, np.int64), np.zeros(rows, bool)
         self._scratch = self.simulator.new_observation()
-        self._layout = [(name, (rows, *s.shape), _torch_dtype(s.dtype)) for name, s in self.simulator.arrays.items()]
+        dtypes = {name: _torch_dtype(s.dtype) for name, s in self.simulator.arrays.items()} | {ACTION_MASK: torch.bool}
+        self._layout = [(name, (rows, *s.shape), dtypes[name]) for name, s in self.simulator.arrays.items()]
         self._make_specs()
 
     def _make_specs(self) -> None:
         batch = self.batch_size
         arrays = {name: _array_spec(spec, batch) for name, spec in self.simulator.arrays.items()}
+        arrays[ACTION_MASK] = Binary(shape=(*batch, self.simulator.max_actions), dtype=torch.bool)
         self.observation_spec = Composite(
             **arrays,
             acting=Bounded(-1, self.simulator.max_agents - 1, batch, dtype=torch.int64),
             elapsed=Unbounded(batch, dtype=torch.int64),
             conflict=Binary(shape=batch, dtype=torch.bool),
+            illegal=Binary(shape=batch, dtype=torch.bool),
             shape=batch,
         ).to(self.device)
         self.action_spec = Categorical(self.simulator.max_actions, batch, dtype=torch.int64, device=self.device)
+        self._link_mask()
         self.reward_spec = Unbounded((*batch, 1), dtype=torch.float64, device=self.device)
         done = {name: Binary(shape=(*batch, 1), dtype=torch.bool) for name in ("done", "terminated", "truncated")}
         self.done_spec = Composite(**done, shape=batch).to(self.device)
 
+    def _link_mask(self) -> None:
+        """Let the action spec read the mask of the choices to be made now: it shares the mask's memory."""
+        self.action_spec.update_mask(torch.from_numpy(self._mask))
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Finish a copy, in which spec and mask no longer share their memory."""
+        super().__setstate__(state)
+        self._link_mask()
+
     def _set_seed(self, seed: int | None) -> None:
         self._seed = as_seed(seed)
-        self._rng = np.random.default_rng(self._seed)
         self._count = np.full(self.batch_size[0], -1, np.int64)  # of each row's running episode
         self._find_instances()
 
@@ -128,7 +147,7 @@ class SchedulingTorchRL(SavesState, EnvBase):
         """The instances that the seed's rows play, and how rows that share one take turns in counting episodes."""
         if self._source is None:
             rows = self.batch_size[0]
-            self._fixed = self._given or self.domain.instances(str(self.scale), rows, self._seed)
+            self._fixed = self._given or self.domain.instances(str(self.scale), rows, self._seed, self.split)
             self._first, self._stride = _turns([instance.identity for instance in self._fixed])
         else:
             self._first, self._stride = np.arange(self.batch_size[0]), np.full(self.batch_size[0], self.batch_size[0])
@@ -139,6 +158,7 @@ class SchedulingTorchRL(SavesState, EnvBase):
         super().load_state(saved)
         if self._seed != seed:
             self._find_instances()
+        self.current()  # for the mask
 
     def _instances(self, rows: Sequence[int] | np.ndarray, count: int | np.ndarray) -> list[Any]:
         if self._source is None:
@@ -162,12 +182,13 @@ class SchedulingTorchRL(SavesState, EnvBase):
             return tensordict
         self._start(rows)
         self.simulator.observe(np.where(rows, self.simulator.acting, -1), self._scratch)
-        self._mask[rows] = self._scratch[ACTION_MASK][rows]
+        self._illegal[rows] = False
+        self._mask[rows] = self._scratch[ACTION_MASK][rows] != 0
         index = torch.from_numpy(np.flatnonzero(rows))
         entries = self._books()
         for name, _, _ in self._layout:
             seen = tensordict.get(name).cpu().clone()  # the finished step keeps its own tensors
-            seen[index] = torch.from_numpy(self._scratch[name])[index]
+            seen[index] = torch.from_numpy(self._scratch[name])[index].to(seen.dtype)
             entries[name] = seen
         return tensordict.update(self._tensordict(entries))
 
@@ -178,19 +199,21 @@ class SchedulingTorchRL(SavesState, EnvBase):
             rows,
             seed=self._seed,
             instances=self._instances(np.flatnonzero(rows), self._count[rows]),
-            episodes=(self._first + self._count * self._stride)[rows].tolist(),
+            episodes=[episode_number(int(n), self.split) for n in (self._first + self._count * self._stride)[rows]],
         )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Take a turn in every row; IllegalActionError names the first row whose choice is not legal."""
+        """Take a turn in every row; IllegalActionError names the first row whose choice lies outside the space."""
         simulator = self.simulator
         actions = tensordict.get("action").cpu().numpy()
-        bad = first_illegal(self._mask, actions, simulator.acting)
-        if bad >= 0:
-            legal = ", ".join(map(str, np.flatnonzero(self._mask[bad])))
-            agent = self.domain.agent_name(int(simulator.acting[bad]))
-            raise IllegalActionError(f"row {bad}: {agent}: action {actions[bad]} is not legal; legal: {legal}")
-        simulator.step(actions)
+        outside = idle_illegal(self._mask, actions, simulator.acting, self._allowed, self._illegal)
+        if outside >= 0:
+            agent = self.domain.agent_name(int(simulator.acting[outside]))
+            highest = simulator.max_actions - 1
+            raise IllegalActionError(
+                f"row {outside}: {agent}: action {actions[outside]}: expected one in [0, {highest}]"
+            )
+        simulator.step(self._allowed)
         return self._tensordict(self._observed() | {"reward": _column(simulator.reward)})
 
     def current(self) -> TensorDictBase:
@@ -201,9 +224,12 @@ class SchedulingTorchRL(SavesState, EnvBase):
         """Everything but the reward, in fresh tensors."""
         simulator = self.simulator
         out = {name: torch.empty(shape, dtype=dtype) for name, shape, dtype in self._layout}
-        arrays = {name: tensor.numpy() for name, tensor in out.items()}
+        # The kernels write masks as int8: the same memory under another name.
+        arrays = {
+            name: (tensor.view(torch.int8) if name == ACTION_MASK else tensor).numpy() for name, tensor in out.items()
+        }
         simulator.observe(simulator.acting, arrays)
-        np.copyto(self._mask, arrays[ACTION_MASK])
+        np.copyto(self._mask, out[ACTION_MASK].numpy())
         return out | self._books()
 
     def _books(self) -> dict[str, torch.Tensor]:
@@ -212,6 +238,7 @@ class SchedulingTorchRL(SavesState, EnvBase):
         out["acting"] = torch.from_numpy(simulator.acting.copy())
         out["elapsed"] = torch.from_numpy(simulator.elapsed.copy())
         out["conflict"] = torch.from_numpy(simulator.conflict.copy())
+        out["illegal"] = torch.from_numpy(self._illegal.copy())
         out["terminated"] = _column(simulator.terminated)
         out["truncated"] = _column(simulator.truncated)
         out["done"] = out["terminated"] | out["truncated"]
@@ -220,15 +247,6 @@ class SchedulingTorchRL(SavesState, EnvBase):
     def _tensordict(self, entries: dict[str, torch.Tensor]) -> TensorDict:
         out = TensorDict(entries, self.batch_size, device=_CPU)
         return out if self.device == _CPU else out.to(self.device)
-
-    def rand_action(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
-        """A legal action for each row, all with the same probability; see marl_sched.envs.api.sampling."""
-        if tensordict is None:
-            tensordict = TensorDict({}, self.batch_size, device=self.device)
-        seen = tensordict.get(ACTION_MASK, None)
-        mask = self._mask if seen is None else seen.cpu().numpy()
-        actions = random_legal(mask, self._rng.random(self.batch_size[0]))
-        return tensordict.set("action", torch.from_numpy(actions).to(self.device))
 
 
 def _check(batch_size: int | None, scale: str | None, instances: Any, source: Any) -> None:

@@ -25,6 +25,12 @@ class RoundSchedules:
         n_tasks = simulator.max_actions - 2
         return spaces.MultiDiscrete(np.tile([n_tasks + 1, simulator.max_agents], (n_tasks, 1)))
 
+    def action_masks(self, simulator: MurseSimulator) -> np.ndarray:
+        """For each pair the slots of this instance's tasks, and 0, then its agents. Bool (N (N + 1 + A),)."""
+        n_tasks, instance = simulator.max_actions - 2, simulator.instances[0]
+        slots, agents = np.arange(n_tasks + 1) <= instance.n_tasks, np.arange(simulator.max_agents) < instance.n_agents
+        return np.tile(np.concatenate([slots, agents]), n_tasks)
+
     def play(self, simulator: MurseSimulator, action: Any) -> tuple[float, dict[str, Any]]:
         """Play one round of row 0; its reward, and which pairs were left out."""
         tasks, agents, illegal = _usable(simulator, np.asarray(action, np.int64))

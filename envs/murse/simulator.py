@@ -93,7 +93,7 @@ class MurseSimulator(TurnSimulator):
         self.batch = len(self.instances)
         self._allocate(pad, graph.SIMPLIFICATIONS.index(simplification))
         self._link()
-        self._loaded = [None] * self.batch
+        self._loaded: list[MurseInstance | None] = [None] * self.batch
         self._seeds = np.zeros(self.batch, np.int64)
         self._episodes = np.full(self.batch, -1, np.int64)
         self.reset(seed=seed)
@@ -114,7 +114,6 @@ class MurseSimulator(TurnSimulator):
 
     def _link(self) -> None:
         """Make the attributes views of the state's rows, which hold the data of all instances."""
-        self._loaded: list[MurseInstance | None]
         self._loaded = list(self.instances)
         rows = self.state.rows
         self.n_agents, self.acting, self.time = rows["n_agents"], rows["acting"], rows["time"]

@@ -10,7 +10,6 @@ from torchrl.envs import TransformedEnv, step_mdp  # noqa: E402
 from torchrl.envs.transforms import ActionMask, StepCounter  # noqa: E402
 from torchrl.envs.utils import check_env_specs  # noqa: E402
 
-from marl_sched.envs.api.sampling import random_legal  # noqa: E402
 from marl_sched.envs.api.torchrl_env import SchedulingTorchRL  # noqa: E402
 from marl_sched.errors import IllegalActionError, InvalidOptionError, UnknownNameError  # noqa: E402
 from tests.envs.problems import HORIZON  # noqa: E402
@@ -18,7 +17,7 @@ from tests.envs.problems import HORIZON  # noqa: E402
 
 def make(domain, **options):
     return SchedulingTorchRL(
-        domain, **{"horizon": HORIZON[getattr(domain, "name", domain)], "batch_size": 3, **options}
+        domain, **{"horizon": HORIZON[getattr(domain, "name", domain)], "batch_size": 3, "seed": 0, **options}
     )
 
 
@@ -48,10 +47,14 @@ def test_rollouts_without_a_policy_choose_legal_targets(domain):
     assert len(rollout["action"].unique()) > 5
 
 
-def test_random_choices_are_uniform_over_legal_targets():
-    mask = np.array([[1, 0, 1, 1, 0]], np.int8)
-    chosen = [int(random_legal(mask, np.array([u]))[0]) for u in (0.0, 0.33, 0.34, 0.66, 0.67, 0.999999)]
-    assert chosen == [0, 0, 2, 2, 3, 3]
+def test_random_choices_are_uniform_over_legal_actions():
+    """Each of n legal actions is drawn about 4000 / n times: five standard deviations of a binomial are allowed."""
+    env = make("airme", batch_size=4000, instances=None, scale="small")
+    td = env.reset()
+    chosen = torch.bincount(env.rand_action(td)["action"], minlength=env.simulator.max_actions)
+    expected = (td["action_mask"] / td["action_mask"].sum(-1, keepdim=True)).sum(0)
+    assert (chosen[expected == 0] == 0).all()
+    assert ((chosen - expected).abs() <= 5 * expected.sqrt()).all()
 
 
 def test_the_mask_transform_serves_policies_that_sample_from_the_spec(domain):
@@ -69,7 +72,12 @@ def test_dtypes_and_shapes_are_those_of_the_page(domain):
     assert td["reward"].shape == (3, 1)
     for name in ("done", "terminated", "truncated"):
         assert td[name].shape == (3, 1)
-    for name, dtype in (("acting", torch.int64), ("elapsed", torch.int64), ("conflict", torch.bool)):
+    for name, dtype in (
+        ("acting", torch.int64),
+        ("elapsed", torch.int64),
+        ("conflict", torch.bool),
+        ("illegal", torch.bool),
+    ):
         assert td[name].shape == (3,)
         assert td[name].dtype == dtype
 
@@ -145,6 +153,7 @@ def test_a_seed_repeats_a_rollout_to_the_last_bit(domain, view):
 
     def trace(seed):
         env.set_seed(seed)
+        torch.manual_seed(seed)
         return env.rollout(50, break_when_any_done=False)
 
     assert (trace(4) == trace(4)).all()
@@ -199,17 +208,30 @@ def test_a_source_gives_new_instances_at_every_reset(domain):
     assert len(asked) == 5
 
 
-def test_an_illegal_choice_raises_and_changes_nothing(domain, bits):
+def test_a_choice_outside_the_space_raises_and_changes_nothing(domain, bits):
     env = make(domain)
     td = advance(env, env.reset(), 4)
     before = [bits(env.simulator.snapshot(b)) for b in range(3)]
     agent = domain.agent_name(int(td["acting"][1]))
-    forbidden = int(np.flatnonzero(td["action_mask"][1].numpy() == 0)[0])
-    for action in (forbidden, -1, env.simulator.max_actions):
+    highest = env.simulator.max_actions - 1
+    for action in (-1, highest + 1):
         td["action"] = torch.tensor([0, action, 0])
-        with pytest.raises(IllegalActionError, match=f"row 1: {agent}: action {action} is not legal; legal: 0"):
+        with pytest.raises(
+            IllegalActionError, match=rf"row 1: {agent}: action {action}: expected one in \[0, {highest}\]"
+        ):
             env.step(td)
     assert [bits(env.simulator.snapshot(b)) for b in range(3)] == before
+
+
+def test_an_illegal_choice_does_nothing_and_is_marked(domain, bits):
+    env, twin = make(domain), make(domain)
+    td, other = advance(env, env.reset(), 4), advance(twin, twin.reset(), 4)
+    twin.load_state(env.save_state())
+    td["action"] = torch.tensor([0, int(np.flatnonzero(td["action_mask"][1].numpy() == 0)[0]), 0])
+    other["action"] = torch.tensor([0, 0, 0])
+    assert env.step(td)["next", "illegal"].tolist() == [False, True, False]
+    assert twin.step(other)["next", "illegal"].tolist() == [False, False, False]
+    assert bits(env.simulator.snapshot(1)) == bits(twin.simulator.snapshot(1))
 
 
 def test_rows_that_are_over_ignore_their_choice(domain):
