@@ -60,18 +60,27 @@ with `stop_share` it terminates when that share of planes is broken. All crews e
 | `view` | `"full"` | or `"local"`, `{"kind": "local", "reach": 1, "comm": 1, "staleness": 0}`, `"random"`, an object |
 | `objective` | `"profit"` | or `"revenue"`, `"availability"` |
 | `horizon` | 720 | hours |
-| `seed` | 0 | of the episodes until a reset gives another |
+| `seed` | None | of the episodes until a reset gives another; None: drawn anew for every environment |
+| `split` | `"train"` | or `"validation"`, `"test"`: instances and noise of different splits never meet |
 | `failure` | `"density"` | as published, or `"hazard"` |
 | `stop_share` | None | the published early end is 0.8 |
+| `flat` | False | True: observations are float32 vectors, the mask beside them (marl_sched.envs.api.layout) |
+| `mask` | `"both"` | or `"observation"`, `"info"`: where the action mask is |
+| `pad_agents` | False | True: always the scale's largest team; who is absent only does nothing |
 | `render_mode` | None | `"ansi"`: a fleet board; `"rgb_array"`: the timeline of every plane |
 
 The view `"random"` is another local view in every episode, drawn within its options `reach_most`, `comm_most`,
 `staleness_most` and `fresh_share` (marl_sched.envs.airme.views).
 
+By default an environment plays the split "train", which `marl-sched evaluate` never meets; with `split="test"` episode
+0 of `reset(seed=s)` is the first episode of the first instance of `marl-sched evaluate --seed s`.
+
 Unknown options raise TypeError. `reset(seed=s)` starts episode 0 of seed s, `reset()` goes on to the next one, with
 a new instance unless one is fixed and with new noise; `reset(options={"instance": ...})` plays that instance once.
 A choice that the mask forbids raises `IllegalActionError` and leaves the turn to be taken; in `parallel_env` it
 idles the crew, whose info says `illegal`.
+`save_state()` and `load_state()` return to any point of an episode; copies by `deepcopy` and `pickle` go on as the
+original would.
 
 ### Example
 ```python
@@ -102,39 +111,73 @@ Institute of Technology, December 2022, chapter 6 (AirME and HetGPO).
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Literal, Required, TypedDict, Unpack
 
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
 from marl_sched.envs.airme.instance import AirmeInstance
+from marl_sched.envs.airme.views import View
 from marl_sched.envs.api.aec import SchedulingAEC
-from marl_sched.envs.api.options import all_options
+from marl_sched.envs.api.options import ENVIRONMENT_DEFAULTS, EnvironmentOptions, with_defaults
 from marl_sched.envs.api.parallel import SchedulingParallel
 
-__all__ = ["env", "parallel_env", "raw_env"]
+__all__ = ["AirmeOptions", "env", "parallel_env", "raw_env"]
 
 
-def raw_env(
-    *,
-    scale: str | None = "small",
-    instance: AirmeInstance | str | Path | None = None,
-    view: Any = "full",
-    objective: str = "profit",
-    horizon: int = 720,
-    seed: int = 0,
-    failure: str = "density",
-    stop_share: float | None = None,
-    render_mode: str | None = None,
-) -> SchedulingAEC:
+class LocalViewOptions(TypedDict, total=False):
+    """The local view as a mapping; see marl_sched.envs.airme.views.LocalView."""
+
+    kind: Required[Literal["local"]]
+    reach: int
+    comm: int
+    staleness: int
+
+
+class RandomViewOptions(TypedDict, total=False):
+    """The random view as a mapping; see marl_sched.envs.airme.views.RandomView."""
+
+    kind: Required[Literal["random"]]
+    reach_most: int
+    comm_most: int
+    staleness_most: int
+    fresh_share: float
+
+
+class AirmeOptions(EnvironmentOptions, total=False):
+    """Options of the AirME environments; the module's page explains them."""
+
+    scale: Literal["small", "medium", "large"] | None
+    instance: AirmeInstance | str | Path | None
+    view: Literal["full", "local", "random"] | LocalViewOptions | RandomViewOptions | View
+    objective: Literal["profit", "revenue", "availability"]
+    failure: Literal["density", "hazard"]
+    stop_share: float | None
+    render_mode: Literal["ansi", "rgb_array"] | None
+
+
+DEFAULTS: AirmeOptions = {
+    "scale": "small",
+    "instance": None,
+    "view": "full",
+    "objective": "profit",
+    "horizon": 720,
+    "failure": "density",
+    "stop_share": None,
+    "render_mode": None,
+    **ENVIRONMENT_DEFAULTS,
+}
+
+
+def raw_env(**options: Unpack[AirmeOptions]) -> SchedulingAEC:
     """The AEC environment without wrappers; the module's page explains the options."""
-    return SchedulingAEC("airme", **locals())
+    return SchedulingAEC("airme", **with_defaults(DEFAULTS, options))
 
 
-def env(**options: Any) -> OrderEnforcingWrapper:
+def env(**options: Unpack[AirmeOptions]) -> OrderEnforcingWrapper:
     """The AEC environment, with PettingZoo's check that it is reset before it is used; options as `raw_env`."""
     return OrderEnforcingWrapper(raw_env(**options))
 
 
-def parallel_env(**options: Any) -> SchedulingParallel:
+def parallel_env(**options: Unpack[AirmeOptions]) -> SchedulingParallel:
     """The Parallel environment; options as `raw_env`."""
-    return SchedulingParallel("airme", **all_options(raw_env, options))
+    return SchedulingParallel("airme", **with_defaults(DEFAULTS, options))

@@ -17,14 +17,9 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, get_type_hints
 
 import numpy as np
 
-<<<<<<< HEAD
 from marl_sched.errors import InvalidOptionError, MarlSchedError, require
-from marl_sched.noise import as_seed
-from marl_sched.plugins import DOMAINS, import_object, load_offered, offered
-=======
-from marl_sched.errors import InvalidOptionError, require
 from marl_sched.noise import Split, instance_generator
->>>>>>> 2c80300 (Keep train, validation and test apart in every environment API, and serve the usual tools: constant teams, flat vectors, one place for the mask, illegal choices in TorchRL idle)
+from marl_sched.plugins import DOMAINS, import_object, load_offered, offered
 
 if TYPE_CHECKING:
     from gymnasium.spaces import Space

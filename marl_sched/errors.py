@@ -15,6 +15,10 @@ from typing import Any
 class MarlSchedError(Exception):
     """Base of all errors that a user can cause and mend."""
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled as message and attributes, so that it arrives from another process whatever its constructor takes."""
+        return _restored, (type(self), self.args, dict(vars(self)))
+
 
 class UnknownNameError(MarlSchedError, ValueError):
     """A name that is not registered; the message lists the names that are."""
@@ -51,6 +55,12 @@ class InvalidMessageError(MarlSchedError, ValueError):
 
 class DeploymentError(MarlSchedError, RuntimeError):
     """A distributed run that could not start or finish; the message names the process that is at fault."""
+
+
+def _restored(kind: type[MarlSchedError], arguments: tuple[Any, ...], attributes: dict[str, Any]) -> MarlSchedError:
+    error = kind.__new__(kind, *arguments)
+    vars(error).update(attributes)
+    return error
 
 
 def require(what: str, name: str, known: Iterable[str]) -> str:

@@ -76,7 +76,8 @@ the episode for all agents together.
 | `view` | `"full"` | or `"local"`, `{"kind": "local", "sensing": 4, "comm": 4}` (map units), a view object |
 | `objective` | `"makespan"` | or `"weighted"` |
 | `horizon` | 10 | rounds, at most as many as the instance has |
-| `seed` | 0 | of the episodes until a reset gives another |
+| `seed` | None | of the episodes until a reset gives another; None: drawn anew for every environment |
+| `split` | `"train"` | or `"validation"`, `"test"`: instances and noise of different splits never meet |
 | `mode` | `"plan"` | or `"online"` |
 | `picking` | `"first"` | or `"mean_unscheduled"`, `"min_unscheduled"`, `"mean_all"` (section 4.2.2) |
 | `rewards` | `"round"` | or `"decision"` (section 3.4.1), `"published"` (equation 5.2 as it stands) |
@@ -85,12 +86,20 @@ the episode for all agents together.
 | `simplification` | `"sparse"` | or `"distance"`: the temporal network's edges (sections 5.4.1, 4.3.1) |
 | `durations` | None | `"deterministic"` or `"stochastic"` instead of the instance's own |
 | `proximity` | None | `"distance"`, `"location"` or `"none"` instead of the instance's own |
+| `flat` | False | True: observations are float32 vectors, the mask beside them (marl_sched.envs.api.layout) |
+| `mask` | `"both"` | or `"observation"`, `"info"`: where the action mask is |
+| `pad_agents` | False | True: always the scale's largest team; who is absent only does nothing |
 | `render_mode` | None | `"ansi"`: commitments; `"rgb_array"`: the last round's Gantt chart, the map before |
+
+By default an environment plays the split "train", which `marl-sched evaluate` never meets; with `split="test"` episode
+0 of `reset(seed=s)` is the first episode of the first instance of `marl-sched evaluate --seed s`.
 
 Unknown options raise TypeError. `reset(seed=s)` starts episode 0 of seed s, `reset()` goes on to the next one, with
 a new instance unless one is fixed and with new noise; `reset(options={"instance": ...})` plays that instance once.
 A choice that the mask forbids raises `IllegalActionError` and leaves the turn to be taken; in `parallel_env` it
 idles the agent, whose info says `illegal`.
+`save_state()` and `load_state()` return to any point of an episode; copies by `deepcopy` and `pickle` go on as the
+original would.
 
 ### Example
 ```python
@@ -115,45 +124,74 @@ Institute of Technology, December 2022, chapters 3 (RoboGNN), 4 (ScheduleNet) an
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Literal, Required, TypedDict, Unpack
 
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
 from marl_sched.envs.api.aec import SchedulingAEC
-from marl_sched.envs.api.options import all_options
+from marl_sched.envs.api.options import ENVIRONMENT_DEFAULTS, EnvironmentOptions, with_defaults
 from marl_sched.envs.api.parallel import SchedulingParallel
 from marl_sched.envs.murse.instance import MurseInstance
+from marl_sched.envs.murse.views import FullView, LocalView
 
-__all__ = ["env", "parallel_env", "raw_env"]
+__all__ = ["MurseOptions", "env", "parallel_env", "raw_env"]
 
 
-def raw_env(
-    *,
-    scale: str | None = "small",
-    instance: MurseInstance | str | Path | None = None,
-    view: Any = "full",
-    objective: str = "makespan",
-    horizon: int = 10,
-    seed: int = 0,
-    mode: str = "plan",
-    picking: str = "first",
-    rewards: str = "round",
-    multiplier: float = 2.0,
-    divisor: float = 1.0,
-    simplification: str = "sparse",
-    durations: str | None = None,
-    proximity: str | None = None,
-    render_mode: str | None = None,
-) -> SchedulingAEC:
+class LocalViewOptions(TypedDict, total=False):
+    """The local view as a mapping; see marl_sched.envs.murse.views.LocalView."""
+
+    kind: Required[Literal["local"]]
+    sensing: float
+    comm: float
+
+
+class MurseOptions(EnvironmentOptions, total=False):
+    """Options of the MuRSE environments; the module's page explains them."""
+
+    scale: str | None
+    instance: MurseInstance | str | Path | None
+    view: Literal["full", "local"] | LocalViewOptions | FullView | LocalView
+    objective: Literal["makespan", "weighted"]
+    mode: Literal["plan", "online"]
+    picking: Literal["first", "mean_unscheduled", "min_unscheduled", "mean_all"]
+    rewards: Literal["round", "decision", "published"]
+    multiplier: float
+    divisor: float
+    simplification: Literal["sparse", "distance"]
+    durations: Literal["deterministic", "stochastic"] | None
+    proximity: Literal["distance", "location", "none"] | None
+    render_mode: Literal["ansi", "rgb_array"] | None
+
+
+DEFAULTS: MurseOptions = {
+    "scale": "small",
+    "instance": None,
+    "view": "full",
+    "objective": "makespan",
+    "horizon": 10,
+    "mode": "plan",
+    "picking": "first",
+    "rewards": "round",
+    "multiplier": 2.0,
+    "divisor": 1.0,
+    "simplification": "sparse",
+    "durations": None,
+    "proximity": None,
+    "render_mode": None,
+    **ENVIRONMENT_DEFAULTS,
+}
+
+
+def raw_env(**options: Unpack[MurseOptions]) -> SchedulingAEC:
     """The AEC environment without wrappers; the module's page explains the options."""
-    return SchedulingAEC("murse", **locals())
+    return SchedulingAEC("murse", **with_defaults(DEFAULTS, options))
 
 
-def env(**options: Any) -> OrderEnforcingWrapper:
+def env(**options: Unpack[MurseOptions]) -> OrderEnforcingWrapper:
     """The AEC environment, with PettingZoo's check that it is reset before it is used; options as `raw_env`."""
     return OrderEnforcingWrapper(raw_env(**options))
 
 
-def parallel_env(**options: Any) -> SchedulingParallel:
+def parallel_env(**options: Unpack[MurseOptions]) -> SchedulingParallel:
     """The Parallel environment; options as `raw_env`."""
-    return SchedulingParallel("murse", **all_options(raw_env, options))
+    return SchedulingParallel("murse", **with_defaults(DEFAULTS, options))

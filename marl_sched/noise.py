@@ -28,16 +28,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-<<<<<<< HEAD
-from marl_sched.errors import require_integer
-from marl_sched.kernels import kernel
-=======
 from marl_sched.errors import require, require_integer
+from marl_sched.kernels import kernel
 
 Split = Literal["train", "validation", "test"]
 SPLITS: dict[str, int] = {"test": 0, "train": 1, "validation": 2}
 _EPISODES_OF_A_SPLIT = 48  # bits: an episode's number within its split is below 2**48
->>>>>>> 2c80300 (Keep train, validation and test apart in every environment API, and serve the usual tools: constant teams, flat vectors, one place for the mask, illegal choices in TorchRL idle)
 
 FIRST_DOMAIN_STREAM = 16
 
@@ -61,9 +57,6 @@ def as_seed(seed: Any) -> int:
     return require_integer("seed", seed, 0, 2**63 - 1)
 
 
-<<<<<<< HEAD
-@kernel(inline="always")
-=======
 def fresh_seed() -> int:
     """A seed in [0, 2**63) from the operating system's entropy, for environments that were given none."""
     return int(np.random.SeedSequence().generate_state(1, np.uint64)[0] >> np.uint64(1))
@@ -88,8 +81,7 @@ def episode_number(episode: int, split: Split = "test") -> int:
     return episode + (SPLITS[require("split", split, SPLITS)] << _EPISODES_OF_A_SPLIT)
 
 
-@njit(cache=True, inline="always")
->>>>>>> 2c80300 (Keep train, validation and test apart in every environment API, and serve the usual tools: constant teams, flat vectors, one place for the mask, illegal choices in TorchRL idle)
+@kernel(inline="always")
 def mix(x: np.uint64) -> np.uint64:
     """The finaliser of SplitMix64, a bijection of 64-bit words in which every input bit moves every output bit."""
     x = (x ^ (x >> _S30)) * _MIX_1

@@ -1,15 +1,16 @@
-"""What users pass to an environment API, brought to what a simulator takes; every refusal names the option."""
+"""What users pass to an environment, brought to what a simulator takes; every refusal names the option."""
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, TypedDict
 
 from marl_sched.domain import Domain, get_domain
+from marl_sched.envs.api.layout import MaskPlace
+from marl_sched.noise import Split
 from marl_sched.problem import as_instance
 
-__all__ = ["all_options", "as_domain", "as_instance"]
+__all__ = ["ENVIRONMENT_DEFAULTS", "EnvironmentOptions", "as_domain", "as_instance", "with_defaults"]
 
 
 def as_domain(domain: str | Domain) -> Domain:
@@ -17,11 +18,29 @@ def as_domain(domain: str | Domain) -> Domain:
     return domain if isinstance(domain, Domain) else get_domain(domain)
 
 
-def all_options(constructor: Callable[..., Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """The options that were given and the defaults of those that were not, as an environment API's signature has them.
+class EnvironmentOptions(TypedDict, total=False):
+    """Options that the PettingZoo environments of every domain have; a domain's own type adds to them."""
 
-    Raises TypeError for an option that the signature does not have.
-    """
-    bound = inspect.signature(constructor).bind(**given)
-    bound.apply_defaults()
-    return dict(bound.arguments)
+    horizon: int
+    seed: int | None
+    split: Split
+    flat: bool
+    mask: MaskPlace
+    pad_agents: bool
+
+
+ENVIRONMENT_DEFAULTS: EnvironmentOptions = {
+    "seed": None,
+    "split": "train",
+    "flat": False,
+    "mask": "both",
+    "pad_agents": False,
+}
+
+
+def with_defaults(defaults: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """The options that were given and the defaults of the others; TypeError for one that has no default."""
+    for name in given:
+        if name not in defaults:
+            raise TypeError(f"unknown option {name!r}; known: {', '.join(defaults)}")
+    return {**defaults, **given}

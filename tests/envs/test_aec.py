@@ -161,7 +161,7 @@ def test_an_episode_repeats_to_the_last_bit(domain, view, pick):
 
 
 def test_reset_without_a_seed_goes_on_to_the_next_episode(domain):
-    env, other = make(domain), make(domain, seed=4)
+    env, other = make(domain, split="test"), make(domain, split="test", seed=4)
     env.reset(seed=4)
     other.reset()
     first = env.simulator.instances[0].identity

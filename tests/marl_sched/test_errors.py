@@ -1,5 +1,9 @@
+import copy
+import pickle  # noqa: TID251 (what is tested is that pools may)
+
 import pytest
 
+from marl_sched import errors
 from marl_sched.errors import InvalidFileError, MarlSchedError, UnknownNameError, require
 
 
@@ -44,3 +48,21 @@ def test_every_error_of_a_user_is_a_marl_sched_error_and_a_value_error():
     for error in (UnknownNameError("view", "x", []), InvalidFileError("a", "b", "c")):
         assert isinstance(error, MarlSchedError)
         assert isinstance(error, ValueError)
+
+
+def every_kind():
+    kinds = [kind for kind in vars(errors).values() if isinstance(kind, type) and issubclass(kind, MarlSchedError)]
+    special = {
+        UnknownNameError: UnknownNameError("view", "ful", ["full", "local"]),
+        InvalidFileError: InvalidFileError("a.json", "planes", "a list", lambda: "no pickle takes this"),
+    }
+    return [special.get(kind) or kind("what, where, expected, got") for kind in kinds]
+
+
+@pytest.mark.parametrize("error", every_kind(), ids=lambda error: type(error).__name__)
+@pytest.mark.parametrize("send", [copy.deepcopy, lambda error: pickle.loads(pickle.dumps(error))])  # noqa: S301
+def test_every_error_arrives_from_another_process_as_it_was(error, send):
+    arrived = send(error)
+    assert type(arrived) is type(error)
+    assert str(arrived) == str(error)
+    assert vars(arrived) == vars(error)
