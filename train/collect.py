@@ -23,10 +23,7 @@ from torch import Tensor
 
 from marl_sched.domain import Domain
 from marl_sched.envs.api.torchrl_env import SchedulingTorchRL
-
-# Last word of the seeds of training instances, to tell them from those of Domain.instances: [seed, i] and
-# [seed, i, 0] are the same seed to numpy.
-_TRAINING = 1
+from marl_sched.noise import instance_generator
 
 Act = Callable[[dict[str, Tensor], np.ndarray], tuple[Tensor, Tensor]]
 """(observations, uniforms float64 (B,)) -> actions int64 (B,) and their log-probabilities float32 (B,)."""
@@ -81,7 +78,8 @@ class Rollout:
 class InstanceSource:
     """The instances of a run: of `rows` rows, row b's episode n plays instance (n rows + b) // episodes.
 
-    An instance depends on (seed, its number) and on its scale, and scales take turns.
+    An instance depends on (seed, its number) and on its scale, and scales take turns. All are of the split "train",
+    which neither validation nor evaluation meets.
     """
 
     def __init__(self, domain: Domain, scales: Sequence[str], *, seed: int, rows: int, episodes: int = 1) -> None:
@@ -91,7 +89,7 @@ class InstanceSource:
     def __call__(self, row: int, count: int) -> Any:
         """The instance that a row plays in its episode `count`."""
         number = (count * self._rows + row) // self._episodes
-        rng = np.random.default_rng([self._seed, number, _TRAINING])
+        rng = instance_generator(self._seed, number, "train")
         return self._domain.generate(self._scales[number % len(self._scales)], rng)
 
 

@@ -19,8 +19,9 @@ class Validation:
         scales = config.env.scales
         self._problem = Problem(
             self._domain,
-            scale=scales[0],
-            count=config.validation.instances,
+            instances=self._domain.instances(
+                scales[0], config.validation.instances, config.validation.seed, "validation"
+            ),
             pad=max(scales, key=list(self._domain.scales).index),  # whose padding some networks are bound to
             episodes=config.validation.episodes,
             seed=config.validation.seed,

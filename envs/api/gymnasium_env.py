@@ -55,6 +55,8 @@ class SchedulingEnv(SavesState, gymnasium.Env):
         self.observation_space: spaces.Space[Any] = graph_space(self.simulator.arrays)
         self.action_space: spaces.Space[Any] = self._joint
         if flat:
+            if not isinstance(self._joint, spaces.MultiDiscrete):
+                raise InvalidOptionError(f"flat: expected joint actions in a MultiDiscrete, got {self._joint}")
             self.observation_space = vector_space(self._vector)
             self.action_space = spaces.MultiDiscrete(self._joint.nvec.ravel())
 

@@ -108,3 +108,19 @@ def test_vectorised_environments_without_a_seed_are_not_alike(domain):
     again, _ = envs.reset(seed=3)
     np.testing.assert_array_equal(first[name], again[name])
     envs.close()
+
+
+def test_the_trainers_instances_are_neither_validated_nor_evaluated_on():
+    pytest.importorskip("torchrl")
+    from marl_sched.domain import get_domain
+    from marl_sched.train.collect import InstanceSource
+    from marl_sched.train.config import load_config
+    from marl_sched.train.validation import Validation
+
+    domain, seed = get_domain("airme"), 3
+    config = load_config(["env=airme", "validation.instances=20", f"validation.seed={seed}", f"seed={seed}"])
+    source = InstanceSource(domain, ["small"], seed=seed, rows=20)
+    trained = {source(row, 0).identity for row in range(20)}
+    validated = {instance.identity for instance in Validation(config)._problem.instances}
+    evaluated = {instance.identity for instance in domain.instances("small", 20, seed)}
+    assert len(trained | validated | evaluated) == 60
