@@ -1,13 +1,15 @@
-"""Starts a world and all its agents as processes on this machine, watches over them, and leaves none behind.
+"""Starts a world and its agents as processes on this machine, watches over them, and leaves none behind.
 
-Processes are spawned, never forked: a forked Zenoh session sends nothing. Every child holds the other end of a pipe
-to this process and ends when it breaks, so that none is left even if this process is killed.
+The processes are forked from a fork server that has imported everything. A process that dies is started again, with
+growing delays and a limit; a world goes on from its log. If this process ends, in whatever way, all others do.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import queue
+import shutil
 import signal
 import subprocess
 import sys
@@ -21,34 +23,48 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-import numpy as np
-
 from marl_sched.agents.registry import create_scheduler, scheduler_names
+from marl_sched.comms.metrics.report import SCHEMA
 from marl_sched.comms.options import AgentOptions, DeployOptions
-from marl_sched.comms.report import absent
-from marl_sched.comms.session import settle_port
+from marl_sched.comms.process import SIGNALS
+from marl_sched.comms.protocol.events import Ending, ExitCode
+from marl_sched.comms.transport.endpoints import settle_port
 from marl_sched.domain import Domain
 from marl_sched.errors import DeploymentError
 from marl_sched.files import read_json, write_json
 
 WORLD = "world"
-POLL = 0.05  # seconds between two looks at the children
-LEAVE = 15.0  # seconds that agents have to leave when the run is over
-GRACE = 2.0  # seconds that a child has to end when asked to, before it is killed
+POLL = 0.05  # seconds between two looks at the processes
+LEAVE = 10.0  # seconds that processes have to leave when the run is over or interrupted
+FIRST_DELAY, LAST_DELAY, STEADY = 0.1, 5.0, 30.0  # seconds: until a restart, at most, and alive until that is forgotten
 Progress = Callable[[str, int, int], None]  # (phase, simulated time, horizon)
 
 
 @dataclass
 class Child:
-    """A process that was started here."""
+    """A process of the deployment, through all its restarts.
+
+    Attributes:
+        pid: of the process that runs, 0 if none does.
+        exit_code: of the last one that ended, negative after a signal, None if none did.
+        restarts: how often it was started again; `in_a_row` without having been steady.
+        restart_at: when it is to be started again.
+    """
 
     name: str
-    process: subprocess.Popen[str]
-    errors: Path  # what it writes to stderr
+    log: Path  # what it writes to stderr
+    start: Callable[[], None]
+    pid: int = 0
+    exit_code: int | None = None
+    restarts: int = 0
+    in_a_row: int = 0
+    started_at: float = 0.0
+    restart_at: float | None = None
 
     def complaint(self) -> str:
         """The last line that it wrote to stderr."""
-        lines = self.errors.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        text = self.log.read_text(encoding="utf-8", errors="replace") if self.log.exists() else ""
+        lines = text.strip().splitlines()
         return lines[-1].removeprefix("error: ") if lines else "it said nothing"
 
 
@@ -57,28 +73,39 @@ class Deployment:
 
     Attributes:
         children: "world" or an agent's name -> its process.
-        phase, moment, horizon: the world's progress, as it last said.
+        phase, tick, horizon: the world's progress, as it last said.
+        folder: where the logs, the run's log and the report are.
     """
 
     def __init__(self, options: DeployOptions) -> None:
         self.options = options
         simulator = options.world.simulator()
-        self.policies = options.policies(int(simulator.n_agents[0]))
+        self._n_agents = int(simulator.n_agents[0])
+        self.policies = options.policies(self._n_agents)
+        self.started_here = options.started_here(self._n_agents)
         for policy in sorted(set(self.policies)):
             _check_policy(policy, options.world.domain())
-        warm_up(options)
         self.endpoint = settle_port(options.world.listen)
         self.children: dict[str, Child] = {}
-        self.phase, self.moment, self.horizon = "starting", 0, options.world.hours
+        self.phase, self.tick, self.horizon = "starting", 0, options.world.horizon
+        self._said: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
+        self._server: subprocess.Popen[bytes] | None = None
+        self._kept = bool(options.folder)
 
     def __enter__(self) -> Deployment:
         """Start all processes."""
-        self._folder = tempfile.TemporaryDirectory(prefix="marl_sched-")
-        self._report = Path(self._folder.name) / "report.json"
+        if self.options.folder:
+            self.folder = Path(self.options.folder)
+            self.folder.mkdir(parents=True, exist_ok=True)
+        else:
+            self.folder = Path(tempfile.mkdtemp(prefix="marl_sched-"))
+        self.report_path = self.folder / "report.json"
         try:
-            self.start_world()
-            for agent in range(len(self.policies)):
-                self.start_agent(agent)
+            self._start_server()
+            self._add(WORLD, self.start_world)
+            for agent in self.started_here:
+                name = self.options.world.domain().agent_name(agent)
+                self._add(name, lambda agent=agent: self.start_agent(agent))  # type: ignore[misc]  # a bound default
         except BaseException:
             self.close()
             raise
@@ -88,13 +115,53 @@ class Deployment:
         """End all processes."""
         self.close()
 
+    def _start_server(self) -> None:
+        world = replace(self.options.world, listen=self.endpoint)
+        asked = json.dumps({"world": asdict(world), "policies": sorted(set(self.policies))})
+        with (self.folder / "fork_server.log").open("ab") as log:
+            self._server = subprocess.Popen(
+                [sys.executable, "-P", "-m", "marl_sched.comms.fork_server", asked],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                env={**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"},
+                start_new_session=True,  # Ctrl-C reaches this process alone, which then ends the others
+            )
+        threading.Thread(target=self._listen, args=(self._server.stdout,), daemon=True).start()
+
+    def _listen(self, lines: Any) -> None:
+        """Take in what the fork server and the world say; a line that neither of them wrote is passed over."""
+        for line in lines:
+            try:
+                said = json.loads(line)
+            except ValueError:
+                continue
+            if isinstance(said, dict):
+                self._said.put(said)
+        self._said.put(None)
+
+    def _order(self, **order: Any) -> None:
+        if self._server is None or self._server.stdin is None:
+            raise DeploymentError("the deployment has not been started")
+        try:
+            self._server.stdin.write(json.dumps(order).encode() + b"\n")
+            self._server.stdin.flush()
+        except BrokenPipeError as error:
+            raise DeploymentError(f"the fork server has ended: {self._server_complaint()}") from error
+
+    def _server_complaint(self) -> str:
+        return Child("fork server", self.folder / "fork_server.log", lambda: None).complaint()
+
+    def _add(self, name: str, start: Callable[[], None]) -> None:
+        self.children[name] = Child(name, self.folder / f"{name}.log", start)
+        start()
+
     def start_world(self) -> None:
-        """Start the world's process; again, if it has died, and then the run begins anew with the same agents."""
-        self.phase, self.moment = "starting", 0
-        options = replace(self.options.world, listen=self.endpoint, report=str(self._report))
-        self._start(WORLD, "marl_sched.comms.world", asdict(options))
-        lines = self.children[WORLD].process.stdout
-        threading.Thread(target=self._follow, args=(lines,), daemon=True).start()
+        """Start the world's process; again, if it has died, and then it goes on from its log."""
+        self.phase = "starting"
+        log = self.options.world.log or str(self.folder / "run.jsonl")
+        options = replace(self.options.world, listen=self.endpoint, report=str(self.report_path), log=log)
+        self._start(WORLD, "world", asdict(options))
 
     def start_agent(self, agent: int) -> None:
         """Start an agent's process; again, if it has died."""
@@ -104,94 +171,150 @@ class Deployment:
             run=self.options.world.run,
             connect=self.endpoint,
             join_timeout=self.options.world.ready_timeout,
+            lease=self.options.world.lease,
         )
-        name = self.options.world.domain().agent_name(agent)
-        self._start(name, "marl_sched.comms.agent", asdict(options))
+        self._start(self.options.world.domain().agent_name(agent), "agent", asdict(options))
 
-    def _start(self, name: str, module: str, options: dict[str, Any]) -> None:
-        errors = Path(self._folder.name) / f"{name}.{time.monotonic_ns()}.stderr"
-        with errors.open("w") as stderr:
-            process = subprocess.Popen(
-                [sys.executable, "-m", module, json.dumps(options), "--supervised"],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE if name == WORLD else subprocess.DEVNULL,
-                stderr=stderr,
-                text=True,
-                env={**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"},
-                start_new_session=True,  # Ctrl-C reaches this process alone, which then ends the others
-            )
-        self.children[name] = Child(name, process, errors)
+    def _start(self, name: str, role: str, options: dict[str, Any]) -> None:
+        child = self.children[name]
+        child.restart_at, child.started_at = None, time.monotonic()
+        self._order(start=name, role=role, options=options, log=str(child.log))
 
-    def _follow(self, lines: Any) -> None:
-        for line in lines:
-            said = json.loads(line)
-            self.phase, self.moment, self.horizon = said["phase"], said["moment"], said["horizon"]
+    def signal(self, name: str, number: int) -> None:
+        """Send a signal to a child that runs."""
+        self._order(signal=name, number=number)
 
-    def wait(self, progress: Progress | None = None) -> dict[str, Any]:
-        """Wait for the end of the run; its report.
-
-        Raises DeploymentError if the world fails, or an agent does before the run has begun; one that dies later
-        is in the report.
-        """
-        world = self.children[WORLD].process
-        shown = ("", -1)
-        while world.poll() is None:
-            if progress is not None and shown != (self.phase, self.moment):
-                shown = (self.phase, self.moment)
-                progress(self.phase, self.moment, self.horizon)
-            if self.phase in ("starting", "gathering"):
-                self._check_agents()
+    def look(self, timeout: float = 0.0) -> None:
+        """Take in what has happened, start again what died; wait up to `timeout` seconds for something to happen."""
+        while True:
             try:
-                world.wait(POLL)
-            except subprocess.TimeoutExpired:
-                continue
-        if world.returncode != 0:
-            raise DeploymentError(f"the world ended with {world.returncode}: {self.children[WORLD].complaint()}")
-        report: dict[str, Any] = read_json(self._report)
-        end = time.monotonic() + LEAVE
-        for name, child in self.children.items():
-            if name not in absent(report["events"]):
-                _wait(child.process, end)
-        report["exit_codes"] = {name: child.process.poll() for name, child in self.children.items()}
+                said = self._said.get(timeout=timeout) if timeout > 0 else self._said.get_nowait()
+            except queue.Empty:
+                break
+            timeout = 0.0
+            if said is None:
+                raise DeploymentError(f"the fork server has ended: {self._server_complaint()}")
+            self._take_in(said)
+        now = time.monotonic()
+        for child in self.children.values():
+            if child.restart_at is not None and now >= child.restart_at:
+                child.restarts += 1
+                child.start()
+
+    def _take_in(self, said: dict[str, Any]) -> None:
+        if "phase" in said:
+            self.phase, self.tick, self.horizon = str(said["phase"]), int(said["tick"]), int(said["horizon"])
+        elif "started" in said:
+            self.children[said["started"]].pid = int(said["pid"])
+        elif "ended" in said:
+            self._ended(self.children[said["ended"]], int(said["code"]))
+
+    def _ended(self, child: Child, code: int) -> None:
+        child.pid, child.exit_code = 0, code
+        if self.phase == "over" or (child.name == WORLD and not _world_died(code)) or code == 0:
+            return
+        if self.phase in ("starting", "gathering") and code == ExitCode.USER_ERROR and child.restarts == 0:
+            raise DeploymentError(f"{child.name} ended with {code} before the run began: {child.complaint()}")
+        now = time.monotonic()
+        child.in_a_row = 0 if now - child.started_at > STEADY else child.in_a_row
+        if child.in_a_row < self.options.restarts:
+            child.restart_at = now + min(FIRST_DELAY * 2**child.in_a_row, LAST_DELAY)
+            child.in_a_row += 1
+
+    def wait(
+        self, progress: Progress | None = None, stopped: Callable[[], int | None] = lambda: None
+    ) -> dict[str, Any]:
+        """Wait for the end of the run; its report, with the exit codes and restarts of all processes.
+
+        `stopped` says by which signal the run is to be ended, None to go on. Raises DeploymentError if the world
+        fails for good, or an agent does before the run has begun; what is lost later is in the report.
+        """
+        world = self.children[WORLD]
+        shown, stop = ("", -1), None
+        while world.pid or world.restart_at is not None or world.exit_code is None:
+            if progress is not None and shown != (self.phase, self.tick):
+                shown = (self.phase, self.tick)
+                progress(self.phase, self.tick, self.horizon)
+            if stop is None and (stop := stopped()) is not None:
+                if not world.pid:
+                    break
+                self.phase = "over"
+                self.signal(WORLD, stop)
+            self.look(POLL)
+        self.phase = "over"
+        if world.exit_code is None or not self.report_path.exists():
+            raise DeploymentError(f"the world ended with {world.exit_code}: {world.complaint()}")
+        if world.exit_code == ExitCode.USER_ERROR or _world_died(world.exit_code):
+            self._kept = True
+            raise DeploymentError(f"the world ended with {world.exit_code}: {world.complaint()}")
+        self._let_leave()
+        report: dict[str, Any] = read_json(self.report_path)
+        report["exit_codes"] = {name: child.exit_code for name, child in self.children.items()}
+        report["restarts"] = {name: child.restarts for name, child in self.children.items() if child.restarts}
+        self._kept |= report["ending"]["kind"] not in (Ending.COMPLETE, Ending.INTERRUPTED)
         return report
 
-    def _check_agents(self) -> None:
-        for name, child in self.children.items():
-            code = child.process.poll()
-            if name != WORLD and code is not None:
-                raise DeploymentError(f"{name} ended with {code} before the run began: {child.complaint()}")
+    def _let_leave(self) -> None:
+        end = time.monotonic() + LEAVE
+        while time.monotonic() < end and any(child.pid for child in self.children.values()):
+            self.look(POLL)
 
     def close(self) -> None:
-        """End all processes: ask, wait GRACE seconds, kill."""
-        processes = [child.process for child in self.children.values()]
-        for process in processes:
-            if process.poll() is None:
-                process.terminate()
-        end = time.monotonic() + GRACE
-        for process in processes:
-            if not _wait(process, end):
-                process.kill()
-                process.wait()
-            for pipe in (process.stdin, process.stdout):
-                if pipe is not None:
-                    pipe.close()
-        self._folder.cleanup()
+        """End all processes: their fork server asks, waits, and kills."""
+        server = self._server
+        if server is not None:
+            if server.stdin is not None:
+                server.stdin.close()
+            try:
+                server.wait(LEAVE)
+            except subprocess.TimeoutExpired:
+                server.kill()
+                server.wait()
+        if not self._kept:
+            shutil.rmtree(self.folder)
+
+
+def _world_died(code: int) -> bool:
+    """Whether a world ended otherwise than by its own decision."""
+    return code < 0 or code == ExitCode.DEFECT
 
 
 def deploy(options: DeployOptions, progress: Progress | None = None) -> dict[str, Any]:
     """Play one run with every agent as a process of its own; the report, with the seconds it took in all.
 
-    It is also written to `options.world.report` if that is set. Raises UnknownNameError, InvalidOptionError and
-    InvalidFileError for what cannot be deployed, DeploymentError naming the process that failed. On SIGTERM and
-    Ctrl-C all processes are ended first.
+    It is also written to `options.world.report` if that is set, whatever the end. Raises UnknownNameError,
+    InvalidOptionError and InvalidFileError for what cannot be deployed, DeploymentError naming the process that
+    failed. SIGINT, SIGTERM and SIGHUP end all processes and then this one, with 128 + n.
     """
     started = time.monotonic()
-    with _sigterm_as_exit(), Deployment(options) as deployment:
-        report = deployment.wait(progress)
-    report["seconds_in_all"] = round(time.monotonic() - started, 3)
-    if options.world.report:
-        write_json(options.world.report, report)
+    report: dict[str, Any] = {}
+    try:
+        with _signals() as stopped, Deployment(options) as deployment:
+            stopped.waiting = True
+            report = deployment.wait(progress, lambda: stopped.number)
+    except SystemExit as end:
+        report = _no_report(options, Ending.INTERRUPTED, f"signal {int(end.code or 0) - 128}", int(end.code or 0))
+        raise
+    except Exception as error:
+        report = _no_report(options, Ending.FAILED, str(error), int(ExitCode.USER_ERROR))
+        raise
+    finally:
+        report["seconds_in_all"] = round(time.monotonic() - started, 3)
+        if options.world.report:
+            write_json(options.world.report, report)
+    if report["ending"]["kind"] == Ending.INTERRUPTED and stopped.number is not None:
+        sys.exit(128 + stopped.number)
     return report
+
+
+def _no_report(options: DeployOptions, ending: Ending, reason: str, code: int) -> dict[str, Any]:
+    """What there is to say of a run whose world left no report."""
+    return {
+        "schema": SCHEMA,
+        "ending": {"kind": str(ending), "reason": reason, "exit_code": code},
+        "env": options.world.env,
+        "run": options.world.run,
+    }
 
 
 def _check_policy(policy: str, domain: Domain) -> None:
@@ -200,39 +323,30 @@ def _check_policy(policy: str, domain: Domain) -> None:
         create_scheduler(policy, domain)
 
 
-def warm_up(options: DeployOptions) -> None:
-    """Compile, once and to Numba's cache on disk, what all the processes are about to use."""
-    telemetry, simulator = options.world.telemetry(), options.world.simulator()
-    local_state = telemetry.local_state(telemetry.frame(simulator), 0)
-    for channel, payload in telemetry.messages(simulator).items():
-        if channel in local_state.channels:
-            local_state.hear(channel, payload)
-    local_state.observe()
-    simulator.observe(simulator.acting)
-    simulator.policy_noise(simulator.acting)
-    simulator.step(np.zeros(1, np.int64))
+@dataclass
+class Stop:
+    """Which signal has come. While nothing waits for it, a signal unwinds the stack instead."""
 
-
-def _wait(process: subprocess.Popen[str], end: float) -> bool:
-    try:
-        process.wait(max(end - time.monotonic(), 0.0))
-    except subprocess.TimeoutExpired:
-        return False
-    return True
+    number: int | None = None
+    waiting: bool = False
 
 
 @contextmanager
-def _sigterm_as_exit() -> Iterator[None]:
-    """Let SIGTERM unwind the stack, so that context managers end the processes."""
+def _signals() -> Iterator[Stop]:
+    """Take SIGINT, SIGTERM and SIGHUP, so that context managers end the processes; only in the main thread."""
+    stop = Stop()
     if threading.current_thread() is not threading.main_thread():
-        yield
+        yield stop
         return
 
-    def leave(number: int, frame: FrameType | None) -> None:
-        sys.exit(128 + number)
+    def note(number: int, frame: FrameType | None) -> None:
+        again, stop.number = stop.number is not None, number
+        if again or not stop.waiting:
+            sys.exit(128 + number)
 
-    before = signal.signal(signal.SIGTERM, leave)
+    before = {number: signal.signal(number, note) for number in SIGNALS}
     try:
-        yield
+        yield stop
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -5,67 +5,106 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
-from marl_sched.comms.messages import run_prefix
+from marl_sched.comms.protocol.keys import run_prefix
+from marl_sched.comms.protocol.rules import ClockKind, WorldRules
 from marl_sched.domain import Domain, Telemetry, get_domain
-from marl_sched.envs import DOMAINS
 from marl_sched.errors import InvalidOptionError, require
 
 if TYPE_CHECKING:
     from marl_sched.simulation import TurnSimulator
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+Sync = Literal["never", "commit"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class WorldOptions:
-    """The plant: which problem, how agents see it, and how long it waits for them.
+    """The plant: which problem, how agents see it, and how long it waits for them. Times in seconds.
 
     Attributes:
         env: a domain's name.
         scale: of the generated instance and of the padding.
         instance: an instance file, of no scale; "" generates the scale's first instance of `seed`.
         seed: of the instance's generator and of the noise.
-        hours: simulated time of the run; 0: the domain's horizon.
+        horizon: simulated time of the run; 0: the domain's.
         objective: what the run is rewarded for; "": the domain's first.
         view, view_options: what agents see.
         run: the run's name, part of every key.
         listen: endpoint, port 0 takes a free one.
-        deadline: seconds that a decision may take; a late one idles the agent for this moment.
-        patience: this many missed deadlines in a row make an agent count as dead: it is not asked any more. It
-            may come back as another incarnation, which is given up at its first miss unless it has decided in time,
-            until 2 x patience turns in a row were waited for in vain: then nobody may decide for it in this run. So
-            between two decisions in time an agent delays the others by at most 2 x patience x deadline seconds; one
-            that stays silent by patience x deadline, one whose process ends or freezes by at most a second, as its
-            liveliness token goes.
-        ready_timeout: seconds to wait for all agents at the start.
+        clock: who owns time: `lockstep`, `paced` or `free`; see WorldRules.
+        pace: seconds per unit of simulated time, of the paced clock.
+        deadline: a decision may take that long; a late one idles the agent for this decision epoch.
+        patience: this many missed deadlines in a row make an incarnation of an agent count as lost. Its successors are
+            given up at their first miss; after 2 x patience turns in a row that were waited for in vain nobody may
+            decide for the agent for a minute. So an agent that is there and slow delays the others by at most
+            2 x patience x deadline seconds before it is barred.
+        grace: how long a missing agent is waited for before it counts as lost; None: 5 s, 0 with the free clock.
+        quorum: share of the agents below which the lockstep clock stands still.
+        standstill: time may stand still for that long before the run ends with a report.
+        ready_timeout: how long to wait for all agents at the start.
+        heartbeat: world and agents say at least that often that they live.
+        lease: a link that is silent for that long counts as dead.
+        log: file of the run's commits; a world that is started with the log of its run goes on from there. "": none.
+        sync: whether every commit is forced to the disk.
         report: file for the JSON report; "" writes none.
     """
 
-    env: str = next(iter(DOMAINS))
+    env: str
     scale: str = "small"
     instance: str = ""
     seed: int = 0
-    hours: int = 0
+    horizon: int = 0
     objective: str = ""
     view: str = "full"
     view_options: Mapping[str, int | float] = field(default_factory=dict)
     run: str = "run"
     listen: str = DEFAULT_ENDPOINT
+    clock: ClockKind = "lockstep"
+    pace: float = 1.0
     deadline: float = 2.0
     patience: int = 3
+    grace: float | None = None
+    quorum: float = 0.5
+    standstill: float = 60.0
     ready_timeout: float = 60.0
+    heartbeat: float = 0.5
+    lease: float = 1.0
+    log: str = ""
+    sync: Sync = "never"
     report: str = ""
 
     def __post_init__(self) -> None:
         """Refuse what cannot be run."""
         run_prefix(self.run)
-        _require_positive(self, "deadline", "ready_timeout")
+        require("clock", self.clock, get_args(ClockKind))
+        require("sync", self.sync, get_args(Sync))
+        _require_positive(self, "pace", "deadline", "standstill", "ready_timeout", "heartbeat", "lease")
         if self.patience < 1:
             raise InvalidOptionError(f"patience: expected at least 1 missed deadline, got {self.patience}")
-        if self.hours < 0 or self.seed < 0:
-            raise InvalidOptionError(f"hours and seed: expected integers >= 0, got {self.hours} and {self.seed}")
+        if self.grace is not None and not self.grace >= 0:
+            raise InvalidOptionError(f"grace: expected a number >= 0 (seconds), got {self.grace}")
+        if not 0 <= self.quorum <= 1:
+            raise InvalidOptionError(f"quorum: expected a share in [0, 1], got {self.quorum}")
+        if self.horizon < 0 or self.seed < 0:
+            raise InvalidOptionError(f"horizon and seed: expected integers >= 0, got {self.horizon} and {self.seed}")
+
+    def rules(self) -> WorldRules:
+        """The protocol's numbers."""
+        grace = self.grace if self.grace is not None else 0.0 if self.clock == "free" else 5.0
+        return WorldRules(
+            clock=self.clock,
+            pace=self.pace,
+            deadline=self.deadline,
+            patience=self.patience,
+            grace=grace,
+            quorum=self.quorum,
+            standstill=self.standstill,
+            ready=self.ready_timeout,
+            heartbeat=self.heartbeat,
+            unheard=max(6 * self.heartbeat, 3 * self.lease),
+        )
 
     def domain(self) -> Domain:
         """The domain, or UnknownNameError."""
@@ -78,23 +117,36 @@ class WorldOptions:
             raise InvalidOptionError(f"env: {self.env} has no telemetry and cannot be deployed")
         return telemetry
 
+    def load_instance(self) -> Any:
+        """The instance; typed errors for a scale or a file that does not fit."""
+        domain = self.domain()
+        domain.require_scale(self.scale)
+        return domain.load(Path(self.instance)) if self.instance else domain.instances(self.scale, 1, self.seed)[0]
+
     def simulator(self) -> TurnSimulator:
-        """The plant's simulator, one row at the start of its episode; typed errors for options that do not fit."""
+        """The plant's simulator, one instance at the start of its episode; typed errors for options that do not fit."""
         domain = self.domain()
         view = domain.view(self.view, **self.view_options)
-        domain.require_scale(self.scale)
-        if self.instance:
-            instance = domain.load(Path(self.instance))
-        else:
-            instance = domain.instances(self.scale, 1, self.seed)[0]
         return domain.simulator(
-            [instance],
+            [self.load_instance()],
             view=view,
-            objective=domain.require_objective(self.objective or domain.objectives[0]),
-            horizon=self.hours or domain.default_horizon,
+            objective=self.chosen_objective(),
+            horizon=self.horizon or domain.default_horizon,
             seed=self.seed,
             pad=None if self.instance else self.scale,
         )
+
+    def chosen_objective(self) -> str:
+        """The objective, or UnknownNameError."""
+        domain = self.domain()
+        return domain.require_objective(self.objective or domain.objectives[0])
+
+    def problem(self) -> dict[str, Any]:
+        """The options that decide how the plant behaves, and which instance it is, as a run's log has them."""
+        names = ("env", "scale", "instance", "seed", "horizon", "objective", "view")
+        given: dict[str, Any] = {name: getattr(self, name) for name in names}
+        identity = int(self.load_instance().identity)
+        return {**given, "view_options": dict(self.view_options), "identity": f"{identity:016x}"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,6 +158,7 @@ class AgentOptions:
         policy: a scheduler's name or a checkpoint's path.
         run, connect: the world's `run` and endpoint.
         join_timeout: seconds to wait for the world, at the start and when it has been lost.
+        lease: a link that is silent for that many seconds counts as dead.
     """
 
     agent: int
@@ -113,11 +166,12 @@ class AgentOptions:
     run: str = "run"
     connect: str = DEFAULT_ENDPOINT
     join_timeout: float = 60.0
+    lease: float = 1.0
 
     def __post_init__(self) -> None:
         """Refuse what cannot be run."""
         run_prefix(self.run)
-        _require_positive(self, "join_timeout")
+        _require_positive(self, "join_timeout", "lease")
         if self.agent < 0:
             raise InvalidOptionError(f"agent: expected an index >= 0, got {self.agent}")
 
@@ -130,19 +184,40 @@ class DeployOptions:
         world: the plant's options.
         policy: what decides for every agent...
         agent_policies: ...but for these, agent's name -> policy.
+        agents: names of the agents that are started here, the others elsewhere; empty: all.
+        folder: where logs of all processes, the run's log and the report are kept; "": in a temporary folder, which
+            is left only if the run did not end well.
+        restarts: how often in a row a process that died is started again.
     """
 
-    world: WorldOptions = field(default_factory=lambda: WorldOptions(listen="tcp/127.0.0.1:0"))
-    policy: str = "condition"
+    world: WorldOptions
+    policy: str
     agent_policies: Mapping[str, str] = field(default_factory=dict)
+    agents: tuple[str, ...] = ()
+    folder: str = ""
+    restarts: int = 5
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be run."""
+        if self.restarts < 0:
+            raise InvalidOptionError(f"restarts: expected an integer >= 0, got {self.restarts}")
 
     def policies(self, n_agents: int) -> list[str]:
         """One policy per agent; UnknownNameError for an agent that does not exist."""
-        domain = self.world.domain()
-        names = [domain.agent_name(i) for i in range(n_agents)]
+        names = self._names(n_agents)
         for name in self.agent_policies:
-            require(f"agent of this {domain.name} problem", name, names)
+            require(f"agent of this {self.world.env} problem", name, names)
         return [self.agent_policies.get(name, self.policy) for name in names]
+
+    def started_here(self, n_agents: int) -> list[int]:
+        """Indices of the agents that are started here; UnknownNameError for one that does not exist."""
+        names = self._names(n_agents)
+        for name in self.agents:
+            require(f"agent of this {self.world.env} problem", name, names)
+        return [i for i, name in enumerate(names) if not self.agents or name in self.agents]
+
+    def _names(self, n_agents: int) -> list[str]:
+        return [self.world.domain().agent_name(i) for i in range(n_agents)]
 
 
 def _require_positive(options: Any, *names: str) -> None:

@@ -1,4 +1,4 @@
-"""What the world's and the agents' processes share: options as JSON, one-line errors, and an end with their parent."""
+"""What the processes of a run share: options as JSON, signals, one-line errors, an end with the parent."""
 
 from __future__ import annotations
 
@@ -10,18 +10,22 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import fields
 from types import FrameType
 from typing import Any, TypeVar
 
 import msgspec
 
+from marl_sched.comms.protocol.events import ExitCode, Interrupted
+from marl_sched.comms.transport.base import Transport
 from marl_sched.errors import InvalidOptionError, MarlSchedError
 
 T = TypeVar("T")
-USER_ERROR = 2
-LAST_WORDS = 2.0  # seconds to end tidily in when the parent is gone
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+LAST_WORDS = 5.0  # seconds to end tidily in when the parent is gone
+_interrupted: list[int] = []  # the signals that `interruptible` took since the process began
 
 
 def parse_options(text: str, kind: type[T]) -> T:
@@ -36,41 +40,82 @@ def parse_options(text: str, kind: type[T]) -> T:
         raise InvalidOptionError(f"options: {error}") from error
 
 
-def run_process(kind: type[T], body: Callable[..., Any], argv: list[str] | None = None) -> None:
+@contextmanager
+def interruptible(transport: Transport) -> Iterator[None]:
+    """SIGINT, SIGTERM and SIGHUP become an event of the transport's inbox; a second one ends the process at once.
+
+    Does nothing in a thread that is not the main one, where Python hears no signals.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def note(number: int, frame: FrameType | None) -> None:
+        if _interrupted:
+            sys.exit(128 + number)
+        _interrupted.append(number)
+        transport.inject(Interrupted(number))
+
+    before = {number: signal.signal(number, note) for number in SIGNALS}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def run_process(
+    kind: type[T],
+    body: Callable[..., Any],
+    exit_code: Callable[[Any], int] = lambda result: 0,
+    argv: list[str] | None = None,
+) -> None:
     """The main function of a process: parse options of type `kind`, call `body(options, progress)`, exit.
 
-    Exits with 0; with 2 and one line on stderr after a MarlSchedError; with 128 + n after signal n. With
-    `--supervised` the process ends when its standard input does, so it never outlives the parent that holds the
+    Exits with `exit_code(result)`; with 2 and one line on stderr after a MarlSchedError; with 128 + n after signal n.
+    With `--supervised` the process ends when its standard input does, so it never outlives the parent that holds the
     other end, and it prints its progress as JSON lines.
     """
+    for number in SIGNALS:
+        signal.signal(number, leave)
     parser = argparse.ArgumentParser(description=sys.modules["__main__"].__doc__)
     parser.add_argument("options", nargs="?", default="{}", help=f"{kind.__name__} as a JSON object")
     parser.add_argument("--supervised", action="store_true", help="end with the standard input, print progress")
     arguments = parser.parse_args(argv)
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
-    signal.signal(signal.SIGTERM, _exit)
     if arguments.supervised:
-        threading.Thread(target=_end_with_parent, daemon=True).start()
+        end_with(0)
+    sys.exit(call(lambda: parse_options(arguments.options, kind), body, exit_code, arguments.supervised))
+
+
+def call(options: Callable[[], T], body: Callable[..., Any], exit_code: Callable[[Any], int], supervised: bool) -> int:
+    """Call a process's body; its exit code. Errors that a user can mend are one line on stderr."""
     try:
-        body(parse_options(arguments.options, kind), _print_progress if arguments.supervised else None)
+        result = body(options(), print_progress if supervised else None)
     except MarlSchedError as error:
         print(f"error: {error}", file=sys.stderr)
-        sys.exit(USER_ERROR)
-    except KeyboardInterrupt:
-        sys.exit(128 + signal.SIGINT)
+        return ExitCode.USER_ERROR
+    return 128 + _interrupted[0] if _interrupted else exit_code(result)
 
 
-def _exit(number: int, frame: FrameType | None) -> None:
-    sys.exit(128 + number)  # unwinds the main thread, which closes the session
+def leave(number: int, frame: FrameType | None) -> None:
+    """End the process by unwinding the main thread, which closes the session."""
+    sys.exit(128 + number)
 
 
-def _end_with_parent() -> None:
-    while os.read(0, 1024):  # unbuffered: a buffered read here would block the interpreter's end
+def end_with(pipe: int) -> None:
+    """End this process when a pipe's other end is closed: by SIGTERM, and by force if that is not enough."""
+    threading.Thread(target=_end_with, args=(pipe,), daemon=True).start()
+
+
+def _end_with(pipe: int) -> None:
+    while os.read(pipe, 1024):  # unbuffered: a buffered read here would block the interpreter's end
         pass
     os.kill(os.getpid(), signal.SIGTERM)
     time.sleep(LAST_WORDS)
     os._exit(128 + signal.SIGTERM)  # the main thread is stuck, and nobody is left to end it
 
 
-def _print_progress(phase: str, moment: int, horizon: int) -> None:
-    print(json.dumps({"phase": phase, "moment": moment, "horizon": horizon}), flush=True)
+def print_progress(phase: str, tick: int, horizon: int) -> None:
+    """One JSON line on stdout."""
+    print(json.dumps({"phase": phase, "tick": tick, "horizon": horizon}), flush=True)

@@ -1,0 +1,162 @@
+"""The run's log: one JSON line for the problem, then one for every commit; appended, never changed.
+
+A world that is restarted with the log of its run plays the commits again, holds their outcomes and rewards against
+what was written down, and goes on from there. `marl-sched replay` does the same and stops at the end. A last line
+that was cut off is not a commit: nobody was told of it before it stood in the log.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any, Literal, Protocol
+
+import msgspec
+
+from marl_sched.comms.plant import Commit, Plant
+from marl_sched.comms.protocol.events import Choice, Outcome
+from marl_sched.errors import InvalidFileError
+
+SCHEMA = 1
+Sync = Literal["never", "commit"]
+_FORCED = (Outcome.LATE, Outcome.ABSENT)
+
+
+class Header(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="run"):
+    """The first line: what is played. `problem` are the world's options that decide how the plant behaves."""
+
+    schema: int
+    run: str
+    problem: dict[str, Any]
+
+
+class Resumed(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="resumed"):
+    """Another epoch of the world goes on from here."""
+
+    epoch: str
+
+
+class Step(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="commit"):
+    """What was applied at once, and what became of it."""
+
+    commits: list[Commit]
+
+
+Line = Header | Resumed | Step
+_encoder, _decoder = msgspec.json.Encoder(), msgspec.json.Decoder(Line)
+
+
+class CommitLog(Protocol):
+    """Where commits are kept."""
+
+    def append(self, line: Resumed | Step) -> None:
+        """Keep a line before anybody is told of it."""
+
+    def commits(self) -> Iterator[Commit]:
+        """All commits so far, in order."""
+
+
+@dataclass
+class MemoryLog:
+    """Commits of a run that nobody continues."""
+
+    lines: list[Resumed | Step] = field(default_factory=list)
+
+    def append(self, line: Resumed | Step) -> None:
+        """See CommitLog.append."""
+        self.lines.append(line)
+
+    def commits(self) -> Iterator[Commit]:
+        """See CommitLog.commits."""
+        return (commit for line in self.lines if isinstance(line, Step) for commit in line.commits)
+
+
+class FileLog:
+    """Commits in a file, one JSON line each; see the module's page.
+
+    Attributes:
+        header: of the file.
+        resumed: whether it held commits when it was opened.
+    """
+
+    def __init__(self, path: Path, header: Header, sync: Sync = "never") -> None:
+        """Open a run's log, or begin it. InvalidFileError if the file is the log of another run or problem."""
+        self.path, self.header, self._sync = path, header, sync
+        lines, end = _whole_lines(path) if path.exists() else ([], 0)
+        if lines and lines[0] != header:
+            raise InvalidFileError(path, "", "the log of this run and problem", _difference(lines[0], header))
+        self.resumed = any(isinstance(line, Step) for line in lines)
+        self._file: IO[bytes] = path.open("r+b" if path.exists() else "w+b")
+        self._file.truncate(end)
+        self._file.seek(end)
+        if not lines:
+            self._write(header)
+
+    def append(self, line: Resumed | Step) -> None:
+        """See CommitLog.append."""
+        self._write(line)
+
+    def _write(self, line: Line) -> None:
+        self._file.write(_encoder.encode(line) + b"\n")
+        self._file.flush()
+        if self._sync == "commit":
+            os.fsync(self._file.fileno())
+
+    def commits(self) -> Iterator[Commit]:
+        """See CommitLog.commits."""
+        return (commit for line in read_log(self.path) if isinstance(line, Step) for commit in line.commits)
+
+    def steps(self) -> Iterator[Step]:
+        """What was applied at once, in order."""
+        return (line for line in read_log(self.path) if isinstance(line, Step))
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def read_log(path: Path) -> list[Line]:
+    """All whole lines of a log; InvalidFileError if one of them is no line of a log."""
+    return _whole_lines(path)[0]
+
+
+def _whole_lines(path: Path) -> tuple[list[Line], int]:
+    """The lines, and where the last one ends."""
+    content = path.read_bytes()
+    end = content.rfind(b"\n") + 1
+    lines: list[Line] = []
+    for number, text in enumerate(content[:end].splitlines(), 1):
+        try:
+            lines.append(_decoder.decode(text))
+        except msgspec.DecodeError as error:
+            raise InvalidFileError(path, f"line {number}", f"a line of a run's log ({error})", text[:60]) from error
+    if lines and not isinstance(lines[0], Header):
+        raise InvalidFileError(path, "line 1", "what is played", type(lines[0]).__name__)
+    if any(isinstance(line, Header) for line in lines[1:]):
+        raise InvalidFileError(path, "", "one run", "several")
+    return lines, end
+
+
+def _difference(found: Line, expected: Header) -> str:
+    if not isinstance(found, Header):
+        return "no header"
+    ours, theirs = msgspec.to_builtins(expected), msgspec.to_builtins(found)
+    pairs = {**{k: (theirs["problem"].get(k), v) for k, v in ours["problem"].items()}, "run": (found.run, expected.run)}
+    return ", ".join(f"{name} {was!r} instead of {now!r}" for name, (was, now) in pairs.items() if was != now)
+
+
+def play_again(plant: Plant, steps: Iterable[Step], path: Path) -> int:
+    """Apply logged commits to a fresh plant; how many there were. InvalidFileError where they come out otherwise."""
+    count = 0
+    for step in steps:
+        plant.state()
+        choices = [
+            Choice(c.agent, c.action, c.outcome if c.outcome in _FORCED else Outcome.DECIDED) for c in step.commits
+        ]
+        again = plant.apply(choices)
+        if again != step.commits:
+            raise InvalidFileError(path, f"commit {count + 1}", f"what this version plays: {again}", step.commits)
+        count += len(again)
+    return count

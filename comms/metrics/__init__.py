@@ -1,0 +1,1 @@
+"""What is counted and reported of a run, in bounded memory."""

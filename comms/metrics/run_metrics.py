@@ -1,0 +1,69 @@
+"""Everything counted in a run, in memory that does not grow with its length."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Any
+
+from marl_sched.comms.metrics.histogram import Histogram
+from marl_sched.comms.protocol.keys import kind_of
+
+MAX_EVENTS = 10_000
+# `stale`: decisions that answer no open turn: late, repeated, or of an incarnation that was given up. `contradicted`:
+# a second decision for a turn with another action. `other_epoch`: said to another run or life of the world.
+# `unanswered`: queries beyond what the world answers in a second. `replaced`, `no_place`, `too_long`: dropped unseen.
+COUNTS = (
+    "conflicts", "illegal", "missed_deadlines", "tick_overruns", "stale", "contradicted", "fenced", "unparsed",
+    "other_epoch", "unanswered", "replaced", "no_place", "too_long",
+)  # fmt: skip
+
+
+@dataclass
+class RunMetrics:
+    """Counts of one run; times in simulated units unless named `_s` or `_ms`."""
+
+    events: list[dict[str, Any]] = field(default_factory=list)  # the first MAX_EVENTS
+    latency: Histogram = field(default_factory=Histogram)  # seconds from a turn to its decision
+    share_sum: float = 0.0  # of the graph that deciding agents saw
+    turns: int = 0
+    standstill_s: float = 0.0
+    slept_s: float = 0.0
+    sent: Counter[str] = field(default_factory=Counter)
+    sent_bytes: Counter[str] = field(default_factory=Counter)
+    heard: Counter[str] = field(default_factory=Counter)
+    heard_bytes: Counter[str] = field(default_factory=Counter)
+    counts: Counter[str] = field(default_factory=Counter)
+
+    def note_sent(self, key: str, payload: bytes) -> None:
+        """Count a message of the world."""
+        self.sent[kind_of(key)] += 1
+        self.sent_bytes[kind_of(key)] += len(payload)
+
+    def note_heard(self, kind: str, payload: bytes) -> None:
+        """Count a message to the world; `kind` is one of few words, whatever its key was."""
+        self.heard[kind] += 1
+        self.heard_bytes[kind] += len(payload)
+
+    def note_event(self, unit: str, time: int, agent: str, event: str, waited_s: float = 0.0) -> None:
+        """Note that an agent joined, was lost, was late, ..."""
+        if len(self.events) >= MAX_EVENTS:
+            self.counts["events_not_kept"] += 1
+            return
+        self.events.append({unit: time, "agent": agent, "event": event, "waited_s": round(waited_s, 4)})
+
+    def latency_ms(self) -> dict[str, float | None]:
+        """Median and 99th percentile of the time from a turn to its decision, None if there was no decision."""
+        quantiles = {"p50": self.latency.quantile(0.5), "p99": self.latency.quantile(0.99)}
+        return {name: None if value is None else round(value * 1000, 4) for name, value in quantiles.items()}
+
+    def messages(self) -> dict[str, Any]:
+        """Counts and bytes by kind, both ways, with totals."""
+        ways = {"sent": (self.sent, self.sent_bytes), "heard": (self.heard, self.heard_bytes)}
+        out: dict[str, Any] = {
+            way: {kind: {"count": counts[kind], "bytes": sizes[kind]} for kind in sorted(counts)}
+            for way, (counts, sizes) in ways.items()
+        }
+        out["count"] = self.sent.total() + self.heard.total()
+        out["bytes"] = self.sent_bytes.total() + self.heard_bytes.total()
+        return out

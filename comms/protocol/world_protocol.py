@@ -1,0 +1,519 @@
+"""What the world does on every event: who is there, whose turn it is, when time goes on. No clock, thread or socket.
+
+The states of a slot and their transitions are in `marl_sched.comms.membership.slots`; the run's own phases are
+`gathering`, `running`, `standstill` (running, but time stands still) and `over`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from marl_sched.comms.membership.slots import Membership, Slot, SlotEvent, SlotState
+from marl_sched.comms.protocol import events as ev
+from marl_sched.comms.protocol import keys
+from marl_sched.comms.protocol import messages as wire
+from marl_sched.comms.protocol.rules import WorldRules
+from marl_sched.errors import InvalidMessageError
+
+IDLE = 0
+RECOVERY = 3.0  # seconds that agents have to be heard again after the world itself has slept: lease and reconnection
+REFUSAL_GAP = 0.1  # seconds between two refusals to one agent
+ANSWERS_PER_AGENT = 4  # queries that the world answers per agent and second, in all
+REASONS: Mapping[wire.Why, str] = {
+    "given_up": "this incarnation has been given up",
+    "unknown": "the world does not count on this incarnation",
+    "other_epoch": "it speaks to another epoch of the world",
+    "taken": "another process decides for this agent",
+    "barred": "too many of its turns in a row were waited for in vain, it is not asked for a while",
+}
+
+
+@dataclass
+class OpenTurn:
+    """A decision that the plant asks for. `turn` is None while nobody can be asked."""
+
+    request: ev.Request
+    turn: wire.Turn | None = None
+    asked_at: float = 0.0
+    deadline: float = math.inf
+    resend_at: float = math.inf
+    give_up_at: float = math.inf  # however often its agent goes missing and returns
+
+
+class WorldProtocol:
+    """One run of the world, from the first hello to the last goodbye.
+
+    Attributes:
+        phase: see the module's page.
+        members: the slots.
+        wake_at: when `handle(Wake(), now)` is due at the latest.
+        ended: how the run ended, None before.
+    """
+
+    def __init__(
+        self,
+        rules: WorldRules,
+        *,
+        run: str,
+        epoch: str,
+        env: str,
+        prefix: str,
+        frame: bytes,
+        channels: Sequence[Sequence[str]],
+        now: float,
+        resumed: bool = False,
+    ) -> None:
+        """`channels` are those that each agent may hear; `resumed`: the run has been played in part before."""
+        self.rules, self.phase = rules, "gathering"
+        self.members = Membership(len(channels), rules.patience, rules.bar)
+        self.ended: ev.End | None = None
+        self._run, self._epoch, self._env, self._prefix, self._frame = run, epoch, env, prefix, frame
+        self._keys, self._channels, self._resumed = keys.AgentKeys(prefix), channels, resumed
+        self._news: dict[str, wire.News] = {}
+        self._open: dict[int, OpenTurn] = {}  # in the order in which the plant asks
+        self._choices: dict[int, ev.Choice] = {}
+        self._tick, self._first_tick = 0, 0
+        self._applying = self._over = False
+        self._paced_from, self._held_until, self._tick_end = 0.0, -math.inf, math.inf
+        self._last, self._forgiving_until = now, -math.inf
+        self._ready_by, self._clock_at, self._standing_since = now + rules.ready, now, math.inf
+        self._farewell_by = math.inf
+        self._refused_at: dict[int, float] = {}
+        self._max_answers = ANSWERS_PER_AGENT * max(len(channels), 8)
+        self._allowance, self._allowance_at = float(self._max_answers), now
+        self.wake_at = now
+
+    # ---- the one way in
+
+    def handle(self, event: ev.Event, now: float) -> list[ev.Effect]:
+        """What to do about an event. `now` never goes back."""
+        out: list[ev.Effect] = []
+        self._notice_sleep(now, out)
+        match event:
+            case ev.Received():
+                self._hear(event, now, out)
+            case ev.TokenAppeared() | ev.TokenVanished():
+                self._token(event, now, out)
+            case ev.Queried():
+                self._answer(event, now, out)
+            case ev.PlantAdvanced():
+                self._advanced(event, now, out)
+            case ev.Interrupted(number):
+                self._finish(ev.End(ev.Ending.INTERRUPTED, f"signal {number}"), now, out)
+        self._pass_time(now, out)
+        self._last = now
+        self.wake_at = self._next_wake()
+        return out
+
+    # ---- time
+
+    def _notice_sleep(self, now: float, out: list[ev.Effect]) -> None:
+        """Move all deadlines by the time in which this process did not run: nobody else is to blame for it."""
+        slept = now - max(self._last, self.wake_at)
+        if slept <= self.rules.slept:
+            return
+        for turn in self._open.values():
+            turn.deadline, turn.give_up_at = turn.deadline + slept, turn.give_up_at + slept
+            turn.resend_at = min(turn.resend_at, now)
+        for slot in self.members.slots:
+            slot.until, slot.heard_at = slot.until + slept, now
+        self._ready_by += slept
+        self._standing_since += slept
+        self._paced_from += slept
+        self._held_until += slept
+        self._tick_end += slept
+        self._forgiving_until = now + max(RECOVERY, self.rules.grace)
+        out.append(ev.Note(-1, "slept", slept))
+
+    def _pass_time(self, now: float, out: list[ev.Effect]) -> None:
+        if self.ended is not None:
+            return
+        if self.phase != "over":
+            self._watch_slots(now, out)
+        if self.phase == "over":
+            if now >= self._farewell_by or not any(slot.present for slot in self.members.slots):
+                self._end(out)
+        elif self.phase == "gathering":
+            self._gather(now, out)
+        else:
+            self._play(now, out)
+        if now >= self._clock_at and self.ended is None:
+            self._tell_clock(now, out)
+
+    def _watch_slots(self, now: float, out: list[ev.Effect]) -> None:
+        for agent, slot in enumerate(self.members.slots):
+            if slot.state == SlotState.BARRED and now >= slot.until:
+                self.members.pardon(agent)
+            elif slot.state == SlotState.READY and now - slot.heard_at >= self.rules.unheard:
+                self._cut(agent, "unheard", now, out)
+            if slot.state == SlotState.MISSING and now >= slot.until:
+                self._lose(agent, "lost", now, out)
+
+    def _tell_clock(self, now: float, out: list[ev.Effect]) -> None:
+        beat = min(self.rules.heartbeat, self.rules.resend) if self.phase == "over" else self.rules.heartbeat
+        self._clock_at = now + beat
+        phase: wire.Phase = self.phase  # type: ignore[assignment]  # one of the literals
+        out.append(ev.Put(keys.CLOCK, wire.Clock(run=self._run, epoch=self._epoch, tick=self._tick, phase=phase)))
+
+    def _next_wake(self) -> float:
+        if self.ended is not None:
+            return math.inf
+        times = [self._clock_at, self._farewell_by]
+        if self.phase == "gathering":
+            times.append(self._ready_by)
+        if self._held_until > self._last:
+            times.append(self._held_until)
+        if self._standing_since < math.inf:
+            times.append(self._standing_since + self.rules.standstill)
+        if self._forgiving_until > self._last:
+            times.append(self._forgiving_until)
+        for agent, turn in self._open.items():
+            if agent not in self._choices:
+                present = self.members.slots[agent].present
+                times += [turn.deadline, turn.resend_at] if present else [turn.give_up_at]
+        for slot in self.members.slots:
+            times.append(slot.until)
+            if slot.state == SlotState.READY:
+                times.append(slot.heard_at + self.rules.unheard)
+        return min(times)
+
+    # ---- phases
+
+    def _gather(self, now: float, out: list[ev.Effect]) -> None:
+        missing = self.members.absent()
+        if missing and now < self._ready_by:
+            return
+        if missing and not (self._resumed and self.members.quorate(self.rules.quorum)):
+            names = ", ".join(f"{self._prefix}_{agent}" for agent in missing)
+            reason = f"not there within {self.rules.ready:g} s: {names}"
+            self._finish(ev.End(ev.Ending.NOT_GATHERED, reason), now, out)
+            return
+        for agent in missing:
+            if self.members.slots[agent].state in (SlotState.VACANT, SlotState.MISSING):
+                self._lose(agent, "lost", now, out)
+        self.phase = "running"
+        self._paced_from, self._first_tick = now, self._tick
+        self._clock_at = now
+        self._begin_tick()
+        self._play(now, out)
+
+    def _begin_tick(self) -> None:
+        if self.rules.clock == "paced":
+            self._held_until = self._paced_from + (self._tick - self._first_tick) * self.rules.pace
+            self._tick_end = self._held_until + self.rules.pace
+
+    def _play(self, now: float, out: list[ev.Effect]) -> None:
+        """Ask who can be asked, pass the turns of those who cannot, and apply the choices when all are there."""
+        if self._applying or now < self._held_until:
+            return
+        if self._over:
+            self._finish(ev.End(ev.Ending.COMPLETE), now, out)
+            return
+        for agent, turn in self._open.items():
+            if agent not in self._choices:
+                self._drive(agent, turn, now, out)
+        if self._stands_still(now):
+            if self._standing_since == math.inf:
+                self._standing_since, self.phase, self._clock_at = now, "standstill", now
+                out.append(ev.Note(-1, "standstill"))
+            elif now >= self._standing_since + self.rules.standstill:
+                reason = f"fewer agents than the quorum, or one that is missing, for {self.rules.standstill:g} s"
+                self._finish(ev.End(ev.Ending.QUORUM_LOST, reason), now, out)
+            return
+        if self._standing_since < math.inf:
+            out.append(ev.Note(-1, "running", now - self._standing_since))
+            self._standing_since, self.phase, self._clock_at = math.inf, "running", now
+        if len(self._choices) == len(self._open):
+            self._applying = True
+            out.append(ev.Apply(tuple(self._choices[agent] for agent in self._open)))
+
+    def _stands_still(self, now: float) -> bool:
+        if self.rules.clock == "lockstep" and not self.members.quorate(self.rules.quorum):
+            return True
+        return any(self._waits_for(turn, now) for agent, turn in self._open.items() if agent not in self._choices)
+
+    def _waits_for(self, turn: OpenTurn, now: float) -> bool:
+        """Whether time stands still because this turn's agent is missing."""
+        patient = self.rules.clock == "lockstep" or now < self._forgiving_until
+        missing = self.members.slots[turn.request.agent].state == SlotState.MISSING
+        return patient and missing and now < turn.give_up_at
+
+    def _drive(self, agent: int, turn: OpenTurn, now: float, out: list[ev.Effect]) -> None:
+        """Ask, ask again, or give one turn up."""
+        slot = self.members.slots[agent]
+        if not slot.present:
+            if self._waits_for(turn, now):
+                return
+            if turn.turn is not None:
+                self.members.miss(agent, now - turn.asked_at)
+            self._choices[agent] = ev.Choice(agent, IDLE, ev.Outcome.ABSENT)
+            return
+        if turn.turn is None or turn.turn.incarnation != slot.incarnation:
+            if now >= self._tick_end:  # the paced clock has gone past this tick
+                out.append(ev.Count("tick_overruns"))
+                self._choices[agent] = ev.Choice(agent, IDLE, ev.Outcome.LATE)
+                return
+            self._ask(agent, slot, turn, now)
+        if slot.state == SlotState.READY:
+            slot.move(SlotEvent.ASK)
+            turn.give_up_at = min(turn.give_up_at, now + self.rules.deadline + self.rules.grace)
+            turn.deadline = min(now + self.rules.deadline, self._tick_end, turn.give_up_at)
+            turn.asked_at, turn.resend_at = now, now
+        if now >= turn.deadline:
+            self._late(agent, now - turn.asked_at, now, out)
+        elif now >= turn.resend_at and turn.turn is not None:
+            turn.resend_at = now + self.rules.resend
+            out.append(ev.Put(self._keys.turn(agent), turn.turn, control=True))
+
+    def _ask(self, agent: int, slot: Slot, turn: OpenTurn, now: float) -> None:
+        if turn.turn is not None:  # its last incarnation went with this turn open
+            self.members.miss(agent, now - turn.asked_at)
+        slot.turns += 1
+        turn.turn = wire.Turn(
+            run=self._run,
+            epoch=self._epoch,
+            tick=self._tick,
+            agent=agent,
+            incarnation=slot.incarnation,
+            sequence=slot.turns,
+            noise=turn.request.noise,
+            needs={channel: self._news[channel].sequence for channel in self._channels[agent]},
+        )
+
+    def _late(self, agent: int, waited: float, now: float, out: list[ev.Effect]) -> None:
+        self._choices[agent] = ev.Choice(agent, IDLE, ev.Outcome.LATE)
+        out += [ev.Count("missed_deadlines"), ev.Note(agent, "late", waited)]
+        if self.members.miss(agent, waited):
+            self._lose(agent, "silent", now, out)
+        else:
+            self.members.slots[agent].move(SlotEvent.MISS)
+
+    def _advanced(self, event: ev.PlantAdvanced, now: float, out: list[ev.Effect]) -> None:
+        for channel, payload in event.changed.items():
+            last = self._news.get(channel)
+            sequence = last.sequence + 1 if last else 1
+            news = wire.News(run=self._run, epoch=self._epoch, channel=channel, sequence=sequence, payload=payload)
+            self._news[channel] = news
+            out.append(ev.Put(channel, news))
+        if event.tick != self._tick:
+            self._tick, self._clock_at = event.tick, now
+            self._begin_tick()
+        self._open = {request.agent: OpenTurn(request) for request in event.requests}
+        self._choices, self._applying, self._over = {}, False, event.over
+
+    def _finish(self, ending: ev.End, now: float, out: list[ev.Effect]) -> None:
+        """Say that it is over until all agents have left, or for `farewell` seconds."""
+        if self.phase == "over":
+            return
+        self.phase, self._ending = "over", ending
+        self._open, self._choices = {}, {}
+        self._held_until, self._standing_since = -math.inf, math.inf
+        self._farewell_by, self._clock_at = now + self.rules.farewell, now
+        if not any(slot.present for slot in self.members.slots):
+            self._tell_clock(now, out)
+            self._end(out)
+
+    def _end(self, out: list[ev.Effect]) -> None:
+        self.ended = self._ending
+        out.append(self.ended)
+
+    # ---- what is heard
+
+    def _hear(self, event: ev.Received, now: float, out: list[ev.Effect]) -> None:
+        try:
+            agent, leaf, _ = self._keys.parse(event.key)
+            if agent >= len(self.members.slots):
+                raise InvalidMessageError(f"{event.key}: there is no agent {agent}")
+            if leaf == "decision":
+                said: wire.Decision | wire.FromAgent = wire.decode(event.payload, wire.Decision)
+            elif leaf == "hello":
+                said = wire.decode(event.payload, wire.Hello, wire.Beat, wire.Goodbye)
+            else:
+                raise InvalidMessageError(f"{event.key}: a token's key carries no message")
+            if said.agent != agent:
+                raise InvalidMessageError(f"{event.key}: speaks for agent {said.agent}")
+        except InvalidMessageError as error:
+            out += [ev.Count("unparsed"), ev.Warn("unparsed", f"dropped a message: {error}")]
+            self._tell_other_version(event, now, out)
+            return
+        if said.run != self._run or said.epoch != self._epoch:
+            out.append(ev.Count("other_epoch"))
+            if isinstance(said, wire.Hello | wire.Beat):
+                self._fence(agent, said.incarnation, "other_epoch", now, out)
+            return
+        match said:
+            case wire.Decision():
+                self._decide(said, now, out)
+            case wire.Hello():
+                self._greet(said, now, out)
+            case wire.Beat():
+                self._beat(said, now, out)
+            case wire.Goodbye():
+                self._part(said, now, out)
+
+    def _tell_other_version(self, event: ev.Received, now: float, out: list[ev.Effect]) -> None:
+        version = wire.other_version(event.payload, wire.Hello, wire.Beat, wire.Decision)
+        if version is None or not self._may_refuse(agent := self._keys.parse(event.key)[0], now):
+            return
+        reason = f"this world speaks version {wire.VERSION} of the protocol, the agent said {version}"
+        out.append(
+            ev.Put(self._keys.turn(agent), wire.Refused(run=self._run, epoch=self._epoch, reason=reason), control=True)
+        )
+
+    def _decide(self, said: wire.Decision, now: float, out: list[ev.Effect]) -> None:
+        turn = self._open.get(said.agent)
+        if turn is None or turn.turn is None or not said.answers(turn.turn):
+            out.append(ev.Count("stale"))
+            return
+        slot, choice = self.members.slots[said.agent], self._choices.get(said.agent)
+        if choice is not None:
+            contradicts = choice.outcome == ev.Outcome.DECIDED and choice.action != said.action
+            out.append(ev.Count("contradicted" if contradicts else "stale"))
+            return
+        if self.members.hear(said.agent, now):
+            out.append(ev.Note(said.agent, "returned"))
+        if slot.state == SlotState.READY:
+            slot.move(SlotEvent.ASK)
+        self.members.answered(said.agent)
+        self._choices[said.agent] = ev.Choice(said.agent, said.action, ev.Outcome.DECIDED, now - turn.asked_at)
+
+    def _greet(self, hello: wire.Hello, now: float, out: list[ev.Effect]) -> None:
+        slot = self.members.slots[hello.agent]
+        if hello.incarnation != slot.incarnation:
+            refusal = self.members.refusal(hello.agent, hello.incarnation)
+            if refusal == "no_token":  # tokens travel apart from messages; it is welcomed when its token is seen
+                slot.early = hello
+                return
+            if refusal is not None:
+                self._fence(hello.agent, hello.incarnation, refusal, now, out)
+                return
+            slot.early = None
+            self.members.register(hello.agent, hello.incarnation, hello.policy, now)
+            out.append(ev.Note(hello.agent, "joined"))
+        elif self.members.hear(hello.agent, now):
+            out.append(ev.Note(hello.agent, "returned"))
+        welcome = wire.Welcome(run=self._run, epoch=self._epoch, agent=hello.agent, incarnation=hello.incarnation)
+        out.append(ev.Put(self._keys.turn(hello.agent), welcome, control=True))
+
+    def _beat(self, beat: wire.Beat, now: float, out: list[ev.Effect]) -> None:
+        slot = self.members.slots[beat.agent]
+        if beat.incarnation != slot.incarnation:
+            self._fence(beat.agent, beat.incarnation, "unknown", now, out)
+            return
+        slot.counts = dict(beat.counts)
+        if self.members.hear(beat.agent, now):
+            out.append(ev.Note(beat.agent, "returned"))
+
+    def _part(self, goodbye: wire.Goodbye, now: float, out: list[ev.Effect]) -> None:
+        slot = self.members.slots[goodbye.agent]
+        if goodbye.incarnation != slot.incarnation:
+            out.append(ev.Count("stale"))
+            return
+        slot.counts = dict(goodbye.counts)
+        self.members.leave(goodbye.agent)
+        if self.phase != "over":
+            out.append(ev.Note(goodbye.agent, "left"))
+
+    def _token(self, event: ev.TokenAppeared | ev.TokenVanished, now: float, out: list[ev.Effect]) -> None:
+        try:
+            agent, leaf, incarnation = self._keys.parse(event.key)
+            if leaf != "alive" or agent >= len(self.members.slots):
+                raise InvalidMessageError(f"{event.key}: not the token of an agent of this run")
+        except InvalidMessageError as error:
+            out += [ev.Count("unparsed"), ev.Warn("unparsed", f"dropped a token: {error}")]
+            return
+        slot = self.members.slots[agent]
+        if isinstance(event, ev.TokenVanished):
+            if incarnation in slot.tokens:
+                slot.tokens.remove(incarnation)
+            if slot.present and slot.incarnation == incarnation and self.phase != "over":
+                self._cut(agent, "gone", now, out)
+            elif slot.present and slot.incarnation == incarnation:
+                self.members.leave(agent)
+            return
+        if incarnation not in slot.tokens:
+            slot.tokens.append(incarnation)
+        if slot.early is not None and slot.early.incarnation == incarnation:
+            self._greet(slot.early, now, out)
+        elif incarnation == slot.incarnation and self.members.hear(agent, now):
+            out.append(ev.Note(agent, "returned"))
+        elif incarnation in slot.fenced:
+            self._fence(agent, incarnation, "given_up", now, out)
+
+    def _cut(self, agent: int, why: str, now: float, out: list[ev.Effect]) -> None:
+        turn = self._open.get(agent)
+        waited = now - turn.asked_at if turn is not None and self.members.slots[agent].state == SlotState.ASKED else 0.0
+        until = now + self.rules.grace
+        if now < self._forgiving_until:
+            until = max(until, self._forgiving_until)
+        self.members.cut(agent, until)
+        out.append(ev.Note(agent, why, waited))
+
+    def _lose(self, agent: int, why: str, now: float, out: list[ev.Effect]) -> None:
+        slot, turn = self.members.slots[agent], self._open.get(agent)
+        if why == "lost" and turn is not None and turn.turn is not None and agent not in self._choices:
+            self.members.miss(agent, now - turn.asked_at)  # it went with its turn open
+            self._choices[agent] = ev.Choice(agent, IDLE, ev.Outcome.ABSENT)
+        self.members.give_up(agent, now)
+        out.append(ev.Note(agent, why, slot.waited))
+        if slot.state == SlotState.BARRED:
+            out.append(ev.Note(agent, "barred"))
+
+    def _may_refuse(self, agent: int, now: float) -> bool:
+        if agent >= len(self.members.slots) or now < self._refused_at.get(agent, -math.inf) + REFUSAL_GAP:
+            return False
+        self._refused_at[agent] = now
+        return True
+
+    def _fence(self, agent: int, incarnation: str, why: wire.Why, now: float, out: list[ev.Effect]) -> None:
+        out.append(ev.Count("fenced"))
+        if self._may_refuse(agent, now):
+            fenced = wire.Fenced(
+                run=self._run, epoch=self._epoch, agent=agent, incarnation=incarnation, why=why, reason=REASONS[why]
+            )
+            out.append(ev.Put(self._keys.turn(agent), fenced, control=True))
+
+    # ---- queries
+
+    def _answer(self, event: ev.Queried, now: float, out: list[ev.Effect]) -> None:
+        """Tell the frame to everybody, and to an agent the state of the channels that it may hear."""
+        if not self._allowed(now):
+            out.append(ev.Count("unanswered"))
+            return
+        if event.key == keys.FRAME:
+            out.append(ev.Reply(event.query, self._the_frame()))
+            return
+        try:
+            if event.key != keys.SNAPSHOT:
+                raise InvalidMessageError(f"{event.key[:60]}: nothing is answered there")
+            asked = wire.decode(event.payload, wire.SnapshotRequest)
+        except InvalidMessageError as error:
+            out += [ev.Count("unparsed"), ev.Warn("unparsed", f"dropped a query: {error}")]
+            return
+        channels = self._channels[asked.agent] if asked.agent < len(self._channels) else ()
+        phase: wire.Phase = self.phase  # type: ignore[assignment]  # one of the literals
+        known = [self._news[channel] for channel in channels if channel in self._news]
+        snapshot = wire.Snapshot(run=self._run, epoch=self._epoch, tick=self._tick, phase=phase, channels=known)
+        out.append(ev.Reply(event.query, snapshot))
+
+    def _the_frame(self) -> wire.Frame:
+        return wire.Frame(
+            run=self._run,
+            epoch=self._epoch,
+            env=self._env,
+            agents=len(self._channels),
+            heartbeat=self.rules.heartbeat,
+            problem=self._frame,
+        )
+
+    def _allowed(self, now: float) -> bool:
+        """Whether one more query may be answered now: a flood of them must not take the world's time."""
+        since = now - self._allowance_at
+        self._allowance = min(self._max_answers, self._allowance + since * self._max_answers)
+        self._allowance_at = now
+        if self._allowance < 1:
+            return False
+        self._allowance -= 1
+        return True

@@ -1,0 +1,1 @@
+"""How bytes travel: the interface that drivers use, Zenoh behind it, and endpoints."""

@@ -1,0 +1,257 @@
+"""Zenoh as the world and the agents use it: a star on explicit TCP endpoints, and one bounded inbox.
+
+The world is the hub: a peer that listens. Agents are clients that connect to it. Callbacks run on Zenoh's own threads
+and do nothing but put an event into the inbox. Scouting and shared memory are off. Nothing is sent with Zenoh's
+blocking congestion control, so that no reader, however slow or frozen, can hold up a sender; the protocol sends
+again what is lost.
+
+The hub's access rules let agents' keys in and nothing else: whoever connects can neither say what the world says nor
+answer in its place, and agents' decisions are relayed to nobody.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import re
+import socket
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import zenoh
+
+from marl_sched.comms.protocol.events import Answered, Event, Queried, Received, TokenAppeared, TokenVanished
+from marl_sched.comms.protocol.keys import MAX_KEY, run_prefix
+from marl_sched.comms.transport.base import MAX_PAYLOAD
+from marl_sched.comms.transport.endpoints import check_endpoint
+from marl_sched.comms.transport.inbox import Inbox
+from marl_sched.errors import DeploymentError
+
+DEFAULT_LEASE = 1.0  # seconds of silence after which a link counts as dead
+QUEUE = 16  # batches that may wait on a link, the most that Zenoh takes
+DROP_AFTER_US = 2000  # for which a full link may hold up a message before it is dropped
+CONNECT_SLICE = 1.0  # seconds for which an attempt to connect may keep a process from hearing signals
+MAX_QUERIES = 64  # that wait for an answer; more are dropped
+QUERY_TIMEOUT = 10.0
+
+
+class ZenohTransport:
+    """A session bound to a run; see Transport."""
+
+    def __init__(self, run: str, connect: Callable[[], zenoh.Session]) -> None:
+        self._prefix, self._connect = run_prefix(run), connect
+        self._inbox = Inbox()
+        self.dropped: Counter[str] = self._inbox.dropped
+        self._queries: dict[int, zenoh.Query] = {}
+        self._queries_lock, self._query_numbers = threading.Lock(), itertools.count(1)
+        self._session = connect()
+        self._tokens: dict[str, zenoh.LivelinessToken] = {}
+        self._subscribers: dict[str, Any] = {}
+
+    def put(self, key: str, payload: bytes, *, control: bool = False) -> None:
+        """See Transport.put."""
+        self._session.put(self._prefix + key, payload, express=control, congestion_control=zenoh.CongestionControl.DROP)
+
+    def receive(self, timeout: float) -> Event | None:
+        """See Transport.receive."""
+        return self._inbox.get(timeout)
+
+    def inject(self, event: Event) -> None:
+        """See Transport.inject."""
+        self._inbox.inject(event)
+
+    def subscribe(self, key: str) -> None:
+        """See Transport.subscribe."""
+
+        def note(sample: zenoh.Sample) -> None:
+            name = self._local(sample.key_expr)
+            if len(sample.payload) > MAX_PAYLOAD or len(name) > MAX_KEY:
+                self.dropped["too_long"] += 1
+            else:
+                self._inbox.put(name, Received(name, sample.payload.to_bytes()))
+
+        origin = zenoh.Locality.REMOTE
+        self._subscribers[key] = self._session.declare_subscriber(self._prefix + key, note, allowed_origin=origin)
+
+    def unsubscribe(self, key: str) -> None:
+        """See Transport.unsubscribe."""
+        self._subscribers.pop(key).undeclare()
+
+    def watch(self, key: str) -> None:
+        """See Transport.watch."""
+
+        def note(sample: zenoh.Sample) -> None:
+            name = self._local(sample.key_expr)
+            if len(name) > MAX_KEY:
+                self.dropped["too_long"] += 1
+                return
+            stands = sample.kind == zenoh.SampleKind.PUT
+            self._inbox.put(("token", name), TokenAppeared(name) if stands else TokenVanished(name))
+
+        self._subscribers[key] = self._session.liveliness().declare_subscriber(self._prefix + key, note, history=True)
+
+    def announce(self, key: str) -> None:
+        """See Transport.announce."""
+        self._tokens[key] = self._session.liveliness().declare_token(self._prefix + key)
+
+    def withdraw(self, key: str) -> None:
+        """See Transport.withdraw."""
+        self._tokens.pop(key).undeclare()
+
+    def serve(self, key: str) -> None:
+        """See Transport.serve."""
+
+        def note(query: zenoh.Query) -> None:
+            payload = query.payload.to_bytes() if query.payload is not None else b""
+            with self._queries_lock:
+                if len(self._queries) >= MAX_QUERIES or len(payload) > MAX_PAYLOAD:
+                    self.dropped["no_place"] += 1
+                    query.drop()
+                    return
+                number = next(self._query_numbers)
+                self._queries[number] = query
+            self._inbox.put(("query", number), Queried(self._local(query.key_expr), payload, number))
+
+        self._subscribers[key] = self._session.declare_queryable(self._prefix + key, note)
+
+    def reply(self, query: int, payload: bytes | None) -> None:
+        """See Transport.reply; None closes the query without an answer."""
+        with self._queries_lock:
+            asked = self._queries.pop(query)
+        if payload is not None:
+            asked.reply(asked.key_expr, payload)
+        asked.drop()
+
+    def ask(self, question: int, key: str, payload: bytes) -> None:
+        """See Transport.ask."""
+
+        def note(answer: zenoh.Reply) -> None:
+            if answer.ok is not None and len(answer.ok.payload) <= MAX_PAYLOAD:
+                self._inbox.put(("answer", question), Answered(question, answer.ok.payload.to_bytes()))
+
+        self._session.get(self._prefix + key, note, payload=payload, timeout=QUERY_TIMEOUT)
+
+    def reopen(self) -> None:
+        """See Transport.reopen."""
+        self.close()
+        self._session = self._connect()
+
+    def close(self) -> None:
+        """See Transport.close."""
+        self._tokens, self._subscribers = {}, {}
+        self._session.close()
+
+    def _local(self, key: Any) -> str:
+        return str(key).removeprefix(self._prefix)
+
+
+def hub(run: str, endpoint: str, prefix: str, lease: float = DEFAULT_LEASE) -> ZenohTransport:
+    """The world's session, listening on an endpoint such as `tcp/127.0.0.1:7447`.
+
+    `prefix` is that of agents' names. DeploymentError if the endpoint is in use.
+    """
+    check_endpoint("listen", endpoint)
+    config = _config(lease, mode="peer", listen={"endpoints": [endpoint]}, access_control=access_rules(run, prefix))
+
+    def connect() -> zenoh.Session:
+        try:
+            return zenoh.open(config)
+        except zenoh.ZError as error:
+            in_use = "address already in use" in str(error).lower()
+            why = "the port is in use" if in_use else _plain(error)
+            raise DeploymentError(f"cannot listen on {endpoint}: {why}") from error
+
+    return ZenohTransport(run, connect)
+
+
+def spoke(run: str, endpoint: str, timeout: float, lease: float = DEFAULT_LEASE) -> ZenohTransport:
+    """An agent's session, connected to the world's endpoint; waits up to `timeout` seconds for it."""
+    check_endpoint("connect", endpoint)
+
+    def connect() -> zenoh.Session:
+        end = time.monotonic() + timeout
+        while True:
+            session = _connect(endpoint, min(CONNECT_SLICE, end - time.monotonic()), lease)
+            if not isinstance(session, zenoh.ZError):
+                return session
+            if time.monotonic() >= end:
+                why = _why(endpoint, session)
+                raise DeploymentError(f"no world at {endpoint} within {timeout:g} s: {why}") from session
+
+    return ZenohTransport(run, connect)
+
+
+def access_rules(run: str, prefix: str) -> dict[str, Any]:
+    """The hub's access control: what whoever connects may say, and what the hub tells them.
+
+    Deny is the default. Agents' hellos, decisions and tokens come in, and questions to the world; what the world says
+    goes out, but not what other agents said.
+    """
+    root = run_prefix(run)
+    from_agents = [f"{root}{prefix}/*/{leaf}" for leaf in ("hello", "decision")]
+    declarations = ["declare_subscriber", "declare_liveliness_subscriber", "liveliness_query"]
+    rules = {
+        "said": _rule("allow", "ingress", ["put"], from_agents),
+        "tokens": _rule("allow", "ingress", ["liveliness_token"], [f"{root}{prefix}/*/alive/*"]),
+        "asked": _rule("allow", "ingress", ["query"], [f"{root}world/frame", f"{root}world/snapshot"]),
+        "heard": _rule("allow", "ingress", declarations, ["**"]),
+        "told": _rule(
+            "allow",
+            "egress",
+            ["put", "reply", "liveliness_token", "declare_queryable", "declare_subscriber", "query"],
+            [f"{root}**"],
+        ),
+        "private": _rule("deny", "egress", ["put"], from_agents),
+    }
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": [{"id": name, **rule} for name, rule in rules.items()],
+        "subjects": [{"id": "anybody"}],
+        "policies": [{"rules": list(rules), "subjects": ["anybody"]}],
+    }
+
+
+def _rule(permission: str, flow: str, messages: list[str], key_exprs: list[str]) -> dict[str, Any]:
+    return {"permission": permission, "flows": [flow], "messages": messages, "key_exprs": key_exprs}
+
+
+def _connect(endpoint: str, seconds: float, lease: float) -> zenoh.Session | zenoh.ZError:
+    """A session connected to an endpoint, or why there was none in time. Signals wait for it to return."""
+    retry = {"period_init_ms": 100, "period_max_ms": 400, "period_increase_factor": 2.0}
+    timeout_ms = max(int(seconds * 1000), 1)
+    connect = {"endpoints": [endpoint], "timeout_ms": timeout_ms, "exit_on_failure": True, "retry": retry}
+    try:
+        return zenoh.open(_config(lease, mode="client", connect=connect))
+    except zenoh.ZError as error:
+        return error
+
+
+def _why(endpoint: str, error: zenoh.ZError) -> str:
+    """Why a connection failed: what the system says of the endpoint, as Zenoh only says that it timed out."""
+    try:
+        with socket.create_connection(check_endpoint("connect", endpoint), CONNECT_SLICE):
+            return _plain(error)
+    except OSError as obstacle:
+        return f"{obstacle.strerror or obstacle} ({_plain(error)})"
+
+
+def _plain(error: zenoh.ZError) -> str:
+    """What Zenoh says, without the places in its source."""
+    return re.sub(r" at /\S+:\d+\.?", "", str(error)).strip()
+
+
+def _config(lease: float, **sections: Any) -> zenoh.Config:
+    queue = {"size": {"data": QUEUE}, "congestion_control": {"drop": {"wait_before_drop": DROP_AFTER_US}}}
+    whole: Mapping[str, Any] = {
+        **sections,
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}, "delay": 0},
+        "transport": {
+            "shared_memory": {"enabled": False},
+            "link": {"tx": {"lease": int(lease * 1000), "queue": queue}, "rx": {"max_message_size": 2 * MAX_PAYLOAD}},
+        },
+    }
+    return zenoh.Config.from_json5(json.dumps(whole))
