@@ -151,7 +151,6 @@ def play_again(plant: Plant, steps: Iterable[Step], path: Path) -> int:
     """Apply logged commits to a fresh plant; how many there were. InvalidFileError where they come out otherwise."""
     count = 0
     for step in steps:
-        plant.state()
         choices = [
             Choice(c.agent, c.action, c.outcome if c.outcome in _FORCED else Outcome.DECIDED) for c in step.commits
         ]

@@ -37,6 +37,7 @@ WORLD = "world"
 POLL = 0.05  # seconds between two looks at the processes
 LEAVE = 10.0  # seconds that processes have to leave when the run is over or interrupted
 FIRST_DELAY, LAST_DELAY, STEADY = 0.1, 5.0, 30.0  # seconds: until a restart, at most, and alive until that is forgotten
+BEING_STARTED = -1  # in place of a process's id
 Progress = Callable[[str, int, int], None]  # (phase, simulated time, horizon)
 
 
@@ -45,7 +46,7 @@ class Child:
     """A process of the deployment, through all its restarts.
 
     Attributes:
-        pid: of the process that runs, 0 if none does.
+        pid: of the process that runs, 0 if none does, BEING_STARTED until the fork server says.
         exit_code: of the last one that ended, negative after a signal, None if none did.
         restarts: how often it was started again; `in_a_row` without having been steady.
         restart_at: when it is to be started again.
@@ -177,7 +178,7 @@ class Deployment:
 
     def _start(self, name: str, role: str, options: dict[str, Any]) -> None:
         child = self.children[name]
-        child.restart_at, child.started_at = None, time.monotonic()
+        child.pid, child.restart_at, child.started_at = BEING_STARTED, None, time.monotonic()
         self._order(start=name, role=role, options=options, log=str(child.log))
 
     def signal(self, name: str, number: int) -> None:
@@ -231,7 +232,7 @@ class Deployment:
         """
         world = self.children[WORLD]
         shown, stop = ("", -1), None
-        while world.pid or world.restart_at is not None or world.exit_code is None:
+        while world.pid or world.restart_at is not None:
             if progress is not None and shown != (self.phase, self.tick):
                 shown = (self.phase, self.tick)
                 progress(self.phase, self.tick, self.horizon)

@@ -7,27 +7,20 @@ The states of a slot and their transitions are in `marl_sched.comms.membership.s
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from marl_sched.comms.membership.slots import Membership, Slot, SlotEvent, SlotState
 from marl_sched.comms.protocol import events as ev
 from marl_sched.comms.protocol import keys
 from marl_sched.comms.protocol import messages as wire
+from marl_sched.comms.protocol.answers import Answers
+from marl_sched.comms.protocol.reception import Reception
 from marl_sched.comms.protocol.rules import WorldRules
 from marl_sched.errors import InvalidMessageError
 
 IDLE = 0
 RECOVERY = 3.0  # seconds that agents have to be heard again after the world itself has slept: lease and reconnection
-REFUSAL_GAP = 0.1  # seconds between two refusals to one agent
-ANSWERS_PER_AGENT = 4  # queries that the world answers per agent and second, in all
-REASONS: Mapping[wire.Why, str] = {
-    "given_up": "this incarnation has been given up",
-    "unknown": "the world does not count on this incarnation",
-    "other_epoch": "it speaks to another epoch of the world",
-    "taken": "another process decides for this agent",
-    "barred": "too many of its turns in a row were waited for in vain, it is not asked for a while",
-}
 
 
 @dataclass
@@ -66,10 +59,11 @@ class WorldProtocol:
         resumed: bool = False,
     ) -> None:
         """`channels` are those that each agent may hear; `resumed`: the run has been played in part before."""
-        self.rules, self.phase = rules, "gathering"
+        self.rules = rules
+        self.phase: wire.Phase = "gathering"
         self.members = Membership(len(channels), rules.patience, rules.bar)
         self.ended: ev.End | None = None
-        self._run, self._epoch, self._env, self._prefix, self._frame = run, epoch, env, prefix, frame
+        self._run, self._epoch, self._prefix = run, epoch, prefix
         self._keys, self._channels, self._resumed = keys.AgentKeys(prefix), channels, resumed
         self._news: dict[str, wire.News] = {}
         self._open: dict[int, OpenTurn] = {}  # in the order in which the plant asks
@@ -80,9 +74,12 @@ class WorldProtocol:
         self._last, self._forgiving_until = now, -math.inf
         self._ready_by, self._clock_at, self._standing_since = now + rules.ready, now, math.inf
         self._farewell_by = math.inf
-        self._refused_at: dict[int, float] = {}
-        self._max_answers = ANSWERS_PER_AGENT * max(len(channels), 8)
-        self._allowance, self._allowance_at = float(self._max_answers), now
+        self._reception = Reception(self.members, self._keys, run, epoch)
+        self._answers = Answers(
+            wire.Frame(run=run, epoch=epoch, env=env, agents=len(channels), heartbeat=rules.heartbeat, problem=frame),
+            channels,
+            now,
+        )
         self.wake_at = now
 
     # ---- the one way in
@@ -97,7 +94,7 @@ class WorldProtocol:
             case ev.TokenAppeared() | ev.TokenVanished():
                 self._token(event, now, out)
             case ev.Queried():
-                self._answer(event, now, out)
+                out += self._answers.answer(event, now, tick=self._tick, phase=self.phase, news=self._news)
             case ev.PlantAdvanced():
                 self._advanced(event, now, out)
             case ev.Interrupted(number):
@@ -154,8 +151,8 @@ class WorldProtocol:
     def _tell_clock(self, now: float, out: list[ev.Effect]) -> None:
         beat = min(self.rules.heartbeat, self.rules.resend) if self.phase == "over" else self.rules.heartbeat
         self._clock_at = now + beat
-        phase: wire.Phase = self.phase  # type: ignore[assignment]  # one of the literals
-        out.append(ev.Put(keys.CLOCK, wire.Clock(run=self._run, epoch=self._epoch, tick=self._tick, phase=phase)))
+        clock = wire.Clock(run=self._run, epoch=self._epoch, tick=self._tick, phase=self.phase)
+        out.append(ev.Put(keys.CLOCK, clock))
 
     def _next_wake(self) -> float:
         if self.ended is not None:
@@ -322,45 +319,15 @@ class WorldProtocol:
     # ---- what is heard
 
     def _hear(self, event: ev.Received, now: float, out: list[ev.Effect]) -> None:
-        try:
-            agent, leaf, _ = self._keys.parse(event.key)
-            if agent >= len(self.members.slots):
-                raise InvalidMessageError(f"{event.key}: there is no agent {agent}")
-            if leaf == "decision":
-                said: wire.Decision | wire.FromAgent = wire.decode(event.payload, wire.Decision)
-            elif leaf == "hello":
-                said = wire.decode(event.payload, wire.Hello, wire.Beat, wire.Goodbye)
-            else:
-                raise InvalidMessageError(f"{event.key}: a token's key carries no message")
-            if said.agent != agent:
-                raise InvalidMessageError(f"{event.key}: speaks for agent {said.agent}")
-        except InvalidMessageError as error:
-            out += [ev.Count("unparsed"), ev.Warn("unparsed", f"dropped a message: {error}")]
-            self._tell_other_version(event, now, out)
-            return
-        if said.run != self._run or said.epoch != self._epoch:
-            out.append(ev.Count("other_epoch"))
-            if isinstance(said, wire.Hello | wire.Beat):
-                self._fence(agent, said.incarnation, "other_epoch", now, out)
-            return
-        match said:
-            case wire.Decision():
+        match self._reception.read(event, now, out):
+            case wire.Decision() as said:
                 self._decide(said, now, out)
-            case wire.Hello():
-                self._greet(said, now, out)
-            case wire.Beat():
-                self._beat(said, now, out)
-            case wire.Goodbye():
+            case wire.Hello() as said:
+                self._reception.greet(said, now, out)
+            case wire.Beat() as said:
+                self._reception.beat(said, now, out)
+            case wire.Goodbye() as said:
                 self._part(said, now, out)
-
-    def _tell_other_version(self, event: ev.Received, now: float, out: list[ev.Effect]) -> None:
-        version = wire.other_version(event.payload, wire.Hello, wire.Beat, wire.Decision)
-        if version is None or not self._may_refuse(agent := self._keys.parse(event.key)[0], now):
-            return
-        reason = f"this world speaks version {wire.VERSION} of the protocol, the agent said {version}"
-        out.append(
-            ev.Put(self._keys.turn(agent), wire.Refused(run=self._run, epoch=self._epoch, reason=reason), control=True)
-        )
 
     def _decide(self, said: wire.Decision, now: float, out: list[ev.Effect]) -> None:
         turn = self._open.get(said.agent)
@@ -378,33 +345,6 @@ class WorldProtocol:
             slot.move(SlotEvent.ASK)
         self.members.answered(said.agent)
         self._choices[said.agent] = ev.Choice(said.agent, said.action, ev.Outcome.DECIDED, now - turn.asked_at)
-
-    def _greet(self, hello: wire.Hello, now: float, out: list[ev.Effect]) -> None:
-        slot = self.members.slots[hello.agent]
-        if hello.incarnation != slot.incarnation:
-            refusal = self.members.refusal(hello.agent, hello.incarnation)
-            if refusal == "no_token":  # tokens travel apart from messages; it is welcomed when its token is seen
-                slot.early = hello
-                return
-            if refusal is not None:
-                self._fence(hello.agent, hello.incarnation, refusal, now, out)
-                return
-            slot.early = None
-            self.members.register(hello.agent, hello.incarnation, hello.policy, now)
-            out.append(ev.Note(hello.agent, "joined"))
-        elif self.members.hear(hello.agent, now):
-            out.append(ev.Note(hello.agent, "returned"))
-        welcome = wire.Welcome(run=self._run, epoch=self._epoch, agent=hello.agent, incarnation=hello.incarnation)
-        out.append(ev.Put(self._keys.turn(hello.agent), welcome, control=True))
-
-    def _beat(self, beat: wire.Beat, now: float, out: list[ev.Effect]) -> None:
-        slot = self.members.slots[beat.agent]
-        if beat.incarnation != slot.incarnation:
-            self._fence(beat.agent, beat.incarnation, "unknown", now, out)
-            return
-        slot.counts = dict(beat.counts)
-        if self.members.hear(beat.agent, now):
-            out.append(ev.Note(beat.agent, "returned"))
 
     def _part(self, goodbye: wire.Goodbye, now: float, out: list[ev.Effect]) -> None:
         slot = self.members.slots[goodbye.agent]
@@ -436,11 +376,11 @@ class WorldProtocol:
         if incarnation not in slot.tokens:
             slot.tokens.append(incarnation)
         if slot.early is not None and slot.early.incarnation == incarnation:
-            self._greet(slot.early, now, out)
+            self._reception.greet(slot.early, now, out)
         elif incarnation == slot.incarnation and self.members.hear(agent, now):
             out.append(ev.Note(agent, "returned"))
         elif incarnation in slot.fenced:
-            self._fence(agent, incarnation, "given_up", now, out)
+            self._reception.fence(agent, incarnation, "given_up", now, out)
 
     def _cut(self, agent: int, why: str, now: float, out: list[ev.Effect]) -> None:
         turn = self._open.get(agent)
@@ -460,60 +400,3 @@ class WorldProtocol:
         out.append(ev.Note(agent, why, slot.waited))
         if slot.state == SlotState.BARRED:
             out.append(ev.Note(agent, "barred"))
-
-    def _may_refuse(self, agent: int, now: float) -> bool:
-        if agent >= len(self.members.slots) or now < self._refused_at.get(agent, -math.inf) + REFUSAL_GAP:
-            return False
-        self._refused_at[agent] = now
-        return True
-
-    def _fence(self, agent: int, incarnation: str, why: wire.Why, now: float, out: list[ev.Effect]) -> None:
-        out.append(ev.Count("fenced"))
-        if self._may_refuse(agent, now):
-            fenced = wire.Fenced(
-                run=self._run, epoch=self._epoch, agent=agent, incarnation=incarnation, why=why, reason=REASONS[why]
-            )
-            out.append(ev.Put(self._keys.turn(agent), fenced, control=True))
-
-    # ---- queries
-
-    def _answer(self, event: ev.Queried, now: float, out: list[ev.Effect]) -> None:
-        """Tell the frame to everybody, and to an agent the state of the channels that it may hear."""
-        if not self._allowed(now):
-            out.append(ev.Count("unanswered"))
-            return
-        if event.key == keys.FRAME:
-            out.append(ev.Reply(event.query, self._the_frame()))
-            return
-        try:
-            if event.key != keys.SNAPSHOT:
-                raise InvalidMessageError(f"{event.key[:60]}: nothing is answered there")
-            asked = wire.decode(event.payload, wire.SnapshotRequest)
-        except InvalidMessageError as error:
-            out += [ev.Count("unparsed"), ev.Warn("unparsed", f"dropped a query: {error}")]
-            return
-        channels = self._channels[asked.agent] if asked.agent < len(self._channels) else ()
-        phase: wire.Phase = self.phase  # type: ignore[assignment]  # one of the literals
-        known = [self._news[channel] for channel in channels if channel in self._news]
-        snapshot = wire.Snapshot(run=self._run, epoch=self._epoch, tick=self._tick, phase=phase, channels=known)
-        out.append(ev.Reply(event.query, snapshot))
-
-    def _the_frame(self) -> wire.Frame:
-        return wire.Frame(
-            run=self._run,
-            epoch=self._epoch,
-            env=self._env,
-            agents=len(self._channels),
-            heartbeat=self.rules.heartbeat,
-            problem=self._frame,
-        )
-
-    def _allowed(self, now: float) -> bool:
-        """Whether one more query may be answered now: a flood of them must not take the world's time."""
-        since = now - self._allowance_at
-        self._allowance = min(self._max_answers, self._allowance + since * self._max_answers)
-        self._allowance_at = now
-        if self._allowance < 1:
-            return False
-        self._allowance -= 1
-        return True

@@ -101,7 +101,7 @@ def _deploy(policy: str, problem: Problem, path: Path) -> dict[str, Any]:
         env=problem.domain.name,
         scale=str(problem.scale),
         seed=problem.seed,
-        hours=problem.horizon,
+        horizon=problem.horizon,
         objective=problem.objective,
         view=problem.view.kind,
         view_options=asdict(problem.view),

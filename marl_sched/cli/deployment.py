@@ -22,6 +22,10 @@ _PROBLEM = f"--env {options.DEFAULT_ENV} --scale small --seed 1 --view local --r
 
 Policy = Annotated[str, typer.Option("--policy", help="A rule's or shipped policy's name, or a checkpoint's path.")]
 Json = options.JsonFile
+Log = Annotated[
+    Path | None,
+    typer.Option("--log", metavar="FILE", help="The run's log of decisions; a world started with it goes on from it."),
+]
 
 
 def add_to(app: typer.Typer) -> None:
@@ -47,13 +51,31 @@ class Plant:
     objective: options.Objective = None
     view: options.View = "full"
     run: Annotated[str, typer.Option("--run", help="The run's name, by which its processes find each other.")] = "run"
+    clock: Annotated[
+        str, typer.Option("--clock", help="Who owns time: lockstep (waits for missing agents), paced, or free.")
+    ] = "lockstep"
+    pace: Annotated[float, typer.Option("--pace", help="Seconds per unit of simulated time, of the paced clock.")] = 1.0
     deadline: Annotated[float, typer.Option("--deadline", help="Seconds that a decision may take.")] = 2.0
     patience: Annotated[
-        int, typer.Option("--patience", help="Missed deadlines in a row after which an agent counts as dead.")
+        int, typer.Option("--patience", help="Missed deadlines in a row after which an agent counts as lost.")
     ] = 3
+    grace: Annotated[
+        float | None,
+        typer.Option("--grace", help="Seconds that a missing agent is waited for (default: 5, free clock: 0)."),
+    ] = None
+    quorum: Annotated[
+        float, typer.Option("--quorum", help="Share of the agents below which the lockstep clock stands still.")
+    ] = 0.5
+    standstill: Annotated[
+        float, typer.Option("--standstill", help="Seconds that time may stand still before the run ends.")
+    ] = 60.0
     ready_timeout: Annotated[
         float, typer.Option("--ready-timeout", help="Seconds to wait for all agents at the start.")
     ] = 60.0
+    lease: Annotated[float, typer.Option("--lease", help="Seconds of silence after which a link counts as dead.")] = 1.0
+    sync: Annotated[
+        str, typer.Option("--sync", help="When the log is forced to the disk: never, or at every commit.")
+    ] = "never"
     own: OwnOptions
 
     def problem(self) -> Problem:
@@ -69,7 +91,7 @@ class Plant:
             episodes=1,
         )
 
-    def world_options(self, listen: str, json: Path | None) -> WorldOptions:
+    def world_options(self, listen: str, json: Path | None, log: Path | None = None) -> WorldOptions:
         """These options as the world process takes them."""
         from marl_sched.comms.options import WorldOptions
 
@@ -82,15 +104,23 @@ class Plant:
             scale=problem.scale or next(iter(problem.domain.scales)),
             instance=str(self.instance or ""),
             seed=self.seed,
-            hours=problem.horizon,
+            horizon=problem.horizon,
             objective=problem.objective,
             view=problem.view.kind,
             view_options=asdict(problem.view),
             run=self.run,
             listen=listen,
+            clock=self.clock,  # type: ignore[arg-type]  # WorldOptions refuses other words
+            pace=self.pace,
             deadline=self.deadline,
             patience=self.patience,
+            grace=self.grace,
+            quorum=self.quorum,
+            standstill=self.standstill,
             ready_timeout=self.ready_timeout,
+            lease=self.lease,
+            log=str(log or ""),
+            sync=self.sync,  # type: ignore[arg-type]  # likewise
             report=str(json or ""),
         )
 
@@ -101,14 +131,15 @@ def world(
     listen: Annotated[
         str, typer.Option("--listen", metavar="ENDPOINT", help="Where to listen for agents.")
     ] = "tcp/127.0.0.1:7447",
+    log: Log = None,
     json: Json = None,
 ) -> None:
     """Be the plant of a run: own the simulator, tell what happens, apply the agents' decisions."""
     from marl_sched.comms.world import serve
 
     with progress_bar() as tell:
-        report = serve(plant.world_options(listen, json), tell)
-    print_report(report)
+        report = serve(plant.world_options(listen, json, log), tell)
+    finish(report)
 
 
 def agent(
@@ -119,12 +150,15 @@ def agent(
         str, typer.Option("--connect", metavar="ENDPOINT", help="Where the world listens.")
     ] = "tcp/127.0.0.1:7447",
     join_timeout: Annotated[float, typer.Option("--join-timeout", help="Seconds to wait for the world.")] = 60.0,
+    lease: Annotated[
+        float, typer.Option("--lease", help="Seconds of silence after which a link counts as dead.")
+    ] = 1.0,
 ) -> None:
     """Be one agent of a run: see through its view and decide with its policy."""
     from marl_sched.comms.agent import run as be_agent
     from marl_sched.comms.options import AgentOptions
 
-    be_agent(AgentOptions(agent=agent, policy=policy, run=run, connect=connect, join_timeout=join_timeout))
+    be_agent(AgentOptions(agent=agent, policy=policy, run=run, connect=connect, join_timeout=join_timeout, lease=lease))
 
 
 def deploy(
@@ -138,6 +172,18 @@ def deploy(
     listen: Annotated[
         str, typer.Option("--listen", metavar="ENDPOINT", help="Where the world listens; port 0: a free one.")
     ] = "tcp/127.0.0.1:0",
+    agents: Annotated[
+        str, typer.Option("--agents", metavar="A,B", help="Agents to start here, the others elsewhere (default: all).")
+    ] = "",
+    folder: Annotated[
+        Path | None,
+        typer.Option(
+            "--folder", metavar="DIR", help="Where to keep every process's log, the run's log and the report."
+        ),
+    ] = None,
+    restarts: Annotated[
+        int, typer.Option("--restarts", help="How often in a row a process that died is started again.")
+    ] = 5,
     json: Json = None,
 ) -> None:
     """Start the plant and one process for each agent, watch over them, and report what they did."""
@@ -147,12 +193,19 @@ def deploy(
 
     by_agent = _by_agent(agent_policy or [])
     problem = plant.problem()
-    chosen = DeployOptions(world=plant.world_options(listen, json), policy=policy, agent_policies=by_agent)
+    chosen = DeployOptions(
+        world=plant.world_options(listen, json),
+        policy=policy,
+        agent_policies=by_agent,
+        agents=tuple(name for name in agents.split(",") if name),
+        folder=str(folder or ""),
+        restarts=restarts,
+    )
     for name in dict.fromkeys([policy, *by_agent.values()]):
         options.tell_of_training(name, card_of(name, problem.domain), problem.view, problem.objective)
     with progress_bar() as tell:
         report = launch(chosen, tell)
-    print_report(report)
+    finish(report)
 
 
 @contextmanager
@@ -165,19 +218,27 @@ def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("starting", total=None)
 
-        def tell(phase: str, moment: int, horizon: int) -> None:
-            progress.update(task, description=phase, completed=moment, total=horizon or None)
+        def tell(phase: str, tick: int, horizon: int) -> None:
+            progress.update(task, description=phase, completed=tick, total=horizon or None)
 
         yield tell
 
 
+def finish(report: dict[str, Any]) -> None:
+    """Print the end of a run, and exit as it ended."""
+    print_report(report)
+    if report["ending"]["exit_code"]:
+        raise typer.Exit(report["ending"]["exit_code"])
+
+
 def print_report(report: dict[str, Any]) -> None:
     """The end of a run in a few lines."""
-    from marl_sched.domain import get_domain
-
     latency, messages = report["latency_ms"], report["messages"]
-    unit = get_domain(report["env"]).unit
-    typer.echo(f"{report['hours']} {unit}, {len(report['agents'])} agents, {len(report['decisions'])} decisions")
+    if report["ending"]["kind"] != "complete":
+        typer.echo(f"the run did not come to its end: {report['ending']['reason']}")
+    typer.echo(
+        f"{report['time']} {report['unit']}, {len(report['agents'])} agents, {len(report['decisions'])} decisions"
+    )
     typer.echo(f"M1 ({report['objective']}): {report['M1']:.4f}")
     typer.echo(f"{messages['count']} messages, {messages['bytes']} bytes")
     if latency["p50"] is not None:

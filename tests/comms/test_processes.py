@@ -11,26 +11,30 @@ import sys
 import time
 import uuid
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from marl_sched.comms.launcher import Deployment, deploy
 from marl_sched.comms.options import DeployOptions, WorldOptions
-from marl_sched.errors import UnknownNameError
+from marl_sched.errors import DeploymentError, UnknownNameError
 
 LOCAL = {"view": "local", "view_options": {"reach": 1, "comm": 1, "staleness": 12}}
-needs_proc = pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="looks for processes in /proc")
+needs_proc = pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="looks for processes in /proc")
 
 
 def world(**changes) -> WorldOptions:
     """Seven crews under a run's name of their own; nobody is late on a busy machine."""
     run = f"test-{uuid.uuid4().hex[:12]}"
-    defaults = {"seed": 0, "hours": 48, "run": run, "listen": "tcp/127.0.0.1:0", "deadline": 30.0, **LOCAL}
+    defaults = {
+        "env": "airme", "seed": 0, "horizon": 48, "run": run, "listen": "tcp/127.0.0.1:0", "deadline": 30.0,
+        "ready_timeout": 200.0, "standstill": 200.0, "grace": 60.0, **LOCAL,
+    }  # fmt: skip
     return WorldOptions(**{**defaults, **changes})
 
 
 def processes_of(run: str) -> list[int]:
-    """Processes that have the run's name on their command line."""
+    """Processes whose command line names the run: the fork server's name is that of all that were forked from it."""
     found = []
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit() and int(entry.name) != os.getpid():
@@ -43,16 +47,28 @@ def processes_of(run: str) -> list[int]:
     return found
 
 
-def wait_until(condition, seconds: float = 60.0) -> None:
+def wait_until(condition, seconds: float = 240.0) -> None:
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, f"still not so after {seconds:g} s"
         time.sleep(0.05)
 
 
-def run_module(name: str, options: dict, timeout: float = 60.0) -> subprocess.CompletedProcess[str]:
+def run_module(name: str, options: dict, timeout: float = 120.0) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-P", "-m", f"marl_sched.comms.{name}", json.dumps(options)]
     return subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)
+
+
+class At:
+    """Does things once, when the run has come to a tick; a `progress` of Deployment.wait."""
+
+    def __init__(self, *steps: tuple[int, Any]) -> None:
+        self.steps, self.done = list(steps), []
+
+    def __call__(self, phase: str, tick: int, horizon: int) -> None:
+        while self.steps and phase in ("running", "standstill") and tick >= self.steps[0][0]:
+            self.steps.pop(0)[1]()
+            self.done.append(tick)
 
 
 @pytest.mark.slow
@@ -71,7 +87,7 @@ def test_processes_play_the_run_that_is_played_in_process(in_process, save_polic
     assert report["decisions"] == reference["decisions"]
     assert report["rewards"] == reference["rewards"]
     assert report["M1"] == reference["M1"]
-    assert report["deaths"] == []
+    assert report["ending"] == {"kind": "complete", "reason": None, "exit_code": 0}
     assert set(report["exit_codes"].values()) == {0}
     assert json.loads((tmp_path / "run.json").read_text()) == report
     assert {phase for phase, _, _ in told} >= {"running"}
@@ -80,125 +96,157 @@ def test_processes_play_the_run_that_is_played_in_process(in_process, save_polic
 
 @pytest.mark.slow
 @needs_proc
-def test_others_go_on_when_an_agent_is_killed_and_the_report_says_so():
-    given = world(hours=400)
-    killed = []
-    with Deployment(DeployOptions(world=given, policy="condition")) as deployment:
-
-        def kill_in_the_middle(phase: str, moment: int, horizon: int) -> None:
-            if phase == "running" and moment >= 20 and not killed:
-                deployment.children["crew_3"].process.kill()
-                killed.append(moment)
-
-        report = deployment.wait(kill_in_the_middle)
-    (death,) = report["deaths"]
-    assert (death["agent"], death["event"]) == ("crew_3", "gone")
-    assert killed[0] <= death["hour"] < given.hours
-    assert death["waited_s"] < 5.0  # far less than the deadline: the liveliness token ends the wait
-    assert report["hours"] == given.hours
-    assert report["exit_codes"]["crew_3"] == -signal.SIGKILL
-    later = [d for d in report["decisions"] if d["hour"] > death["hour"]]
-    assert {d["outcome"] for d in later if d["agent"] == "crew_3"} == {"absent"}
-    assert {d["agent"] for d in later} == {f"crew_{i}" for i in range(7)}
-    assert "absent" not in {d["outcome"] for d in later if d["agent"] != "crew_3"}
+def test_killed_agent_is_started_again_and_nothing_is_lost(in_process, tmp_path):
+    given = world(horizon=3000)
+    options = DeployOptions(world=given, policy="condition", folder=str(tmp_path / "kept"))
+    with Deployment(options) as deployment:
+        kill = At((20, lambda: deployment.signal("crew_3", signal.SIGKILL)))
+        report = deployment.wait(kill)
+    assert kill.done
+    assert report["restarts"] == {"crew_3": 1}
+    mine = [e["event"] for e in report["events"] if e["agent"] == "crew_3"]
+    assert mine == ["joined", "gone", "joined"]
+    assert report["decisions"] == in_process(given, ["condition"] * 7)["decisions"]
+    assert (tmp_path / "kept" / "crew_3.log").exists()
+    assert (tmp_path / "kept" / "run.jsonl").exists()
     assert processes_of(given.run) == []
 
 
 @pytest.mark.slow
 @needs_proc
-def test_frozen_agent_is_given_up_and_comes_back_as_another_incarnation():
-    given = world(hours=1000, deadline=0.5)
-    frozen, thawed = [], []
+def test_agent_that_is_lost_is_said_in_report_and_exit_code():
+    given = world(horizon=3000, grace=0.5)
+    with Deployment(DeployOptions(world=given, policy="condition", restarts=0)) as deployment:
+        report = deployment.wait(At((20, lambda: deployment.signal("crew_3", signal.SIGKILL))))
+    (death,) = report["deaths"]
+    assert (death["agent"], death["event"]) == ("crew_3", "lost")
+    assert report["ending"] == {"kind": "complete", "reason": None, "exit_code": 3}
+    assert report["exit_codes"]["crew_3"] == -signal.SIGKILL
+    assert report["time"] == given.horizon
+    later = [d for d in report["decisions"] if d["hour"] > death["hour"]]
+    assert {d["outcome"] for d in later if d["agent"] == "crew_3"} == {"absent"}
+    assert "absent" not in {d["outcome"] for d in later if d["agent"] != "crew_3"}
+
+
+@pytest.mark.slow
+@needs_proc
+def test_world_that_is_killed_goes_on_from_its_log(in_process):
+    given = world(horizon=3000)
+    with Deployment(DeployOptions(world=given, policy="condition")) as deployment:
+        kill = At((20, lambda: deployment.signal("world", signal.SIGKILL)))
+        report = deployment.wait(kill)
+    reference = in_process(given, ["condition"] * 7)
+    assert kill.done
+    assert report["restarts"]["world"] == 1
+    assert report["decisions"] == reference["decisions"]
+    assert report["rewards"] == reference["rewards"]
+    assert {name: code for name, code in report["exit_codes"].items() if code} == {}
+
+
+@pytest.mark.slow
+@needs_proc
+def test_world_that_is_frozen_for_a_while_loses_nobody(in_process):
+    given = world(horizon=3000)
     with Deployment(DeployOptions(world=given, policy="condition")) as deployment:
 
-        def freeze_then_thaw(phase: str, moment: int, horizon: int) -> None:
-            process = deployment.children["crew_3"].process
-            if phase == "running" and moment >= 20 and not frozen:
-                process.send_signal(signal.SIGSTOP)
-                frozen.append(moment)
-            elif frozen and not thawed and moment >= frozen[0] + 100:  # no repair is that long: its turn has come
-                process.send_signal(signal.SIGCONT)
-                thawed.append(moment)
+        def freeze() -> None:
+            deployment.signal("world", signal.SIGSTOP)
+            time.sleep(3.0)
+            deployment.signal("world", signal.SIGCONT)
 
-        report = deployment.wait(freeze_then_thaw)
-    mine = [e for e in report["events"] if e["agent"] == "crew_3" and e["event"] != "late"]
-    events = [e["event"] for e in mine]
-    assert events in (["joined", "gone", "joined"], ["joined", "silent", "joined"]), (report["exit_codes"], thawed)
-    assert mine[1]["waited_s"] <= report["delay_bound_s"] + 0.5
+        report = deployment.wait(At((20, freeze)))
+    assert report["deaths"] == []
+    assert report["slept_s"] > 1.0
+    assert report["decisions"] == in_process(given, ["condition"] * 7)["decisions"]
+
+
+@pytest.mark.slow
+@needs_proc
+def test_frozen_agent_is_given_up_and_comes_back_as_another_incarnation():
+    given = world(horizon=2000, deadline=0.5, grace=0.5)
+    with Deployment(DeployOptions(world=given, policy="condition")) as deployment:
+        report = deployment.wait(
+            At(
+                (20, lambda: deployment.signal("crew_3", signal.SIGSTOP)),
+                (200, lambda: deployment.signal("crew_3", signal.SIGCONT)),  # no repair is that long: its turn has come
+            )
+        )
+    mine = [e["event"] for e in report["events"] if e["agent"] == "crew_3" and e["event"] not in ("late", "gone")]
+    assert mine[0] == mine[-1] == "joined"
+    assert set(mine[1:-1]) <= {"lost", "silent", "unheard", "returned"}
     assert report["exit_codes"]["crew_3"] == 0
 
 
 @pytest.mark.slow
 @needs_proc
-def test_agents_outlive_their_world_and_serve_its_successor(in_process):
-    given = world(hours=300)
-    with Deployment(DeployOptions(world=given, policy="condition")) as deployment:
-        wait_until(lambda: deployment.moment >= 10)
-        deployment.children["world"].process.kill()
-        deployment.children["world"].process.wait()
-        deployment.start_world()
-        report = deployment.wait()
-    reference = in_process(given, ["condition"] * 7)
-    assert report["decisions"] == reference["decisions"]
-    assert report["rewards"] == reference["rewards"]
-    assert set(report["exit_codes"].values()) == {0}
-
-
-@pytest.mark.slow
-@needs_proc
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
-def test_no_process_is_left_when_the_launcher_is_ended(number):
-    given = world(hours=10**6)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
+@pytest.mark.parametrize("at", ["start", "running"])
+def test_launcher_that_is_ended_leaves_a_report_and_no_process_or_folder(tmp_path, number, at):
+    given = world(horizon=10**6)
     code = (
         "import json, sys\n"
         "from marl_sched.comms.launcher import deploy\n"
         "from marl_sched.comms.options import DeployOptions, WorldOptions\n"
-        "deploy(DeployOptions(world=WorldOptions(**json.loads(sys.argv[1])), policy='condition'))\n"
+        "print('begun', flush=True)\n"
+        "def progress(phase, tick, horizon):\n    print(phase, flush=True)\n"
+        "deploy(DeployOptions(world=WorldOptions(**json.loads(sys.argv[1])), policy='condition'), progress)\n"
     )
-    options = json.dumps({**{name: getattr(given, name) for name in ("seed", "hours", "run", "listen")}, **LOCAL})
-    launcher = subprocess.Popen([sys.executable, "-P", "-c", code, options], stderr=subprocess.DEVNULL)
+    report, temporary = tmp_path / "report.json", tmp_path / "tmp"
+    temporary.mkdir()
+    names = ("env", "seed", "horizon", "run", "listen", "ready_timeout")
+    options = json.dumps({**{name: getattr(given, name) for name in names}, "report": str(report), **LOCAL})
+    launcher = subprocess.Popen(
+        [sys.executable, "-P", "-c", code, options],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**os.environ, "TMPDIR": str(temporary)},
+    )  # fmt: skip
     try:
-        wait_until(lambda: len(processes_of(given.run)) == 9)  # itself, the world, seven crews
-        time.sleep(1.0)  # let some of them come so far as to have a session
+        line = ""
+        while line != ("begun\n" if at == "start" else "running\n"):
+            line = launcher.stdout.readline()
+            assert line, launcher.stderr.read()
         launcher.send_signal(number)
-        launcher.wait(timeout=30)
-        wait_until(lambda: processes_of(given.run) == [], 15)
+        _, errors = launcher.communicate(timeout=120)
+        wait_until(lambda: processes_of(given.run) == [], 60)
     finally:
         launcher.kill()
         launcher.wait()
         for pid in processes_of(given.run):
             os.kill(pid, signal.SIGKILL)
+    if number != signal.SIGKILL:
+        assert launcher.returncode == 128 + number
+        assert "Traceback" not in errors
+        assert json.loads(report.read_text())["ending"]["kind"] == "interrupted"
+        assert list(temporary.iterdir()) == []
 
 
 @pytest.mark.slow
 @needs_proc
-def test_error_of_an_agent_ends_all_processes_and_names_it(tmp_path):
+def test_error_of_an_agent_before_the_run_ends_all_processes_and_names_it(tmp_path):
     broken = tmp_path / "policy.safetensors"
     broken.write_bytes(b"no weights")
-    code = (
-        "import sys\n"
-        "from marl_sched.comms.launcher import deploy\n"
-        "from marl_sched.comms.options import DeployOptions, WorldOptions\n"
-        "from marl_sched.errors import DeploymentError\n"
-        "options = DeployOptions(world=WorldOptions(run=sys.argv[1], listen='tcp/127.0.0.1:0'),\n"
-        "                        agent_policies={'crew_2': sys.argv[2]})\n"
-        "try:\n    deploy(options)\nexcept DeploymentError as error:\n    print(error)\n"
-    )
-    run = world().run
-    done = subprocess.run(
-        [sys.executable, "-P", "-c", code, run, str(broken)], capture_output=True, text=True, timeout=120, check=True
-    )
-    assert done.stdout.startswith("crew_2 ended with 2 before the run began: ")
-    assert str(tmp_path) in done.stdout
-    assert done.stdout.count("\n") == 1
-    assert processes_of(run) == []
+    given = world(report=str(tmp_path / "report.json"))
+    with pytest.raises(DeploymentError, match=r"policy\.safetensors|policy\.json"):
+        deploy(DeployOptions(world=given, policy="condition", agent_policies={"crew_2": str(broken)}))
+    assert json.loads((tmp_path / "report.json").read_text())["ending"]["kind"] == "failed"
+    assert processes_of(given.run) == []
+
+
+@pytest.mark.slow
+@needs_proc
+def test_part_of_the_team_is_started_here_and_the_rest_elsewhere():
+    given = world(horizon=10, ready_timeout=2.0)
+    options = DeployOptions(world=given, policy="condition", agents=("crew_0", "crew_2"))
+    with pytest.raises(DeploymentError, match=r"not there within 2 s: crew_1, crew_3, crew_4, crew_5, crew_6"):
+        deploy(options)
 
 
 def test_unknown_policy_and_agent_are_refused_before_anything_starts():
     with pytest.raises(UnknownNameError, match="unknown scheduler 'conditoin'; did you mean 'condition'"):
         Deployment(DeployOptions(world=world(), policy="conditoin"))
     with pytest.raises(UnknownNameError, match=r"'crew_9'.*Known: crew_0, .*crew_6"):
-        Deployment(DeployOptions(world=world(), agent_policies={"crew_9": "random"}))
+        Deployment(DeployOptions(world=world(), policy="random", agent_policies={"crew_9": "random"}))
+    with pytest.raises(UnknownNameError, match="'crew_9'"):
+        Deployment(DeployOptions(world=world(), policy="random", agents=("crew_9",)))
 
 
 @pytest.mark.slow
@@ -207,7 +255,7 @@ def test_port_in_use_is_one_line_and_exit_code_2():
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
-        done = run_module("world", {"listen": endpoint})
+        done = run_module("world", {"env": "airme", "listen": endpoint})
     assert done.returncode == 2
     assert done.stderr == f"error: cannot listen on {endpoint}: Address already in use\n"
     assert done.stdout == ""
@@ -220,13 +268,14 @@ def test_port_in_use_is_one_line_and_exit_code_2():
         ("agent", {"agent": 0, "policy": "condition", "connect": "tcp/127.0.0.1:1", "join_timeout": 0.5}, "no world"),
         ("agent", {"agent": -1, "policy": "condition"}, "agent: expected an index >= 0, got -1"),
         ("agent", {"agent": "x", "policy": "condition"}, "Expected `int`, got `str` - at `$.agent`"),
-        ("world", {"huors": 3}, "unknown huors"),
+        ("world", {"env": "airme", "huors": 3}, "unknown huors"),
         ("world", {"env": "airmee"}, "did you mean 'airme'"),
-        ("world", {"scale": "tiny"}, "unknown scale of airme 'tiny'"),
-        ("world", {"view": "lokal"}, "did you mean 'local'"),
-        ("world", {"view": "full", "view_options": {"reach": 1}}, "reach"),
-        ("world", {"listen": "127.0.0.1:7447"}, "expected an endpoint such as tcp/127.0.0.1:7447"),
-        ("world", {"deadline": 0}, "deadline: expected a number > 0"),
+        ("world", {"env": "airme", "scale": "tiny"}, "unknown scale of airme 'tiny'"),
+        ("world", {"env": "airme", "view": "lokal"}, "did you mean 'local'"),
+        ("world", {"env": "airme", "view": "full", "view_options": {"reach": 1}}, "reach"),
+        ("world", {"env": "airme", "listen": "127.0.0.1:7447"}, "expected an endpoint such as tcp/127.0.0.1:7447"),
+        ("world", {"env": "airme", "deadline": 0}, "deadline: expected a number > 0"),
+        ("world", {"env": "airme", "clock": "fast"}, "Invalid enum value 'fast'"),
     ],
 )
 def test_wrong_options_are_one_line_and_exit_code_2(name, options, message):
@@ -241,7 +290,7 @@ IMPORTS = """
 import sys
 import marl_sched.comms.{module}
 from marl_sched.comms.options import WorldOptions
-WorldOptions(seed=0).simulator()
+WorldOptions(env="airme", seed=0).simulator()
 loaded = sorted(name for name in sys.modules if name.split(".")[0] in {{"torch", "tensordict"}})
 print(loaded + sorted(name for name in sys.modules if name.startswith(("marl_sched.agents", "marl_sched.train"))))
 """
@@ -261,3 +310,17 @@ def test_agent_that_follows_a_rule_does_not_import_torch():
     )
     done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, check=True, timeout=240)
     assert done.stdout.endswith("False\n")
+
+
+def test_protocol_imports_neither_clock_thread_socket_nor_network():
+    forbidden = {"time", "threading", "socket", "zenoh", "asyncio", "selectors", "datetime", "random"}
+    from marl_sched.comms import membership, protocol
+
+    for package in (protocol, membership):
+        for path in Path(package.__file__).parent.glob("*.py"):
+            imported = {
+                line.split()[1].split(".")[0]
+                for line in path.read_text().splitlines()
+                if line.startswith(("import ", "from "))
+            }
+            assert not imported & forbidden, path
