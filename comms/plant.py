@@ -64,7 +64,9 @@ class SimulatedPlant:
         self.domain, self.telemetry, self.simulator = domain, telemetry, simulator
         self.n_agents = int(simulator.n_agents[0])
         self.frame = telemetry.frame(simulator)
-        self.channels = [telemetry.local_state(self.frame, agent).channels for agent in range(self.n_agents)]
+        self.channels: Sequence[Sequence[str]] = [
+            telemetry.local_state(self.frame, agent).channels for agent in range(self.n_agents)
+        ]
         self._said: dict[str, bytes] = {}
         self._observation = simulator.new_observation()
 

@@ -55,7 +55,7 @@ class World:
         """`plant`: the domain's simulator unless given, at its start or, with a log, where that ends."""
         self.options, self.transport, self.metrics, self._clock = options, transport, RunMetrics(), clock
         self.domain, self.telemetry = options.domain(), options.telemetry()
-        self.plant = plant or SimulatedPlant(self.domain, self.telemetry, options.simulator())
+        self.plant: Plant = plant or SimulatedPlant(self.domain, self.telemetry, options.simulator())
         self.epoch = f"{time.time_ns():x}-{os.getpid():x}"
         self.commits = commits if commits is not None else MemoryLog()
         resumed = isinstance(self.commits, FileLog) and self.commits.resumed

@@ -55,7 +55,8 @@ class AgentProtocol:
     ) -> None:
         """`identity` is unique to this process; its incarnations are `<identity>-<count>`."""
         self.rules, self.state = rules, AgentState.REOPENING
-        self.incarnation, self.counts, self.ended = "", Counter[str](), None
+        self.incarnation, self.counts = "", Counter[str]()
+        self.ended: ev.End | None = None
         self.subscriptions: set[str] = set()
         self._run, self._agent, self._policy, self._identity, self._mind = run, agent, policy, identity, mind
         self._epoch, self._heartbeat, self._tick = "", 0.5, 0
@@ -71,8 +72,6 @@ class AgentProtocol:
         self._announced = ""
         self._heard_at = self._last = self.wake_at = now
         self._seek_at = -math.inf
-
-    # ---- the one way in
 
     def handle(self, event: ev.Event, now: float) -> list[ev.Effect]:
         """What to do about an event. `now` never goes back. After the end nothing is done."""
@@ -100,8 +99,6 @@ class AgentProtocol:
         self.wake_at = self._next_wake()
         return out
 
-    # ---- time
-
     def _notice_sleep(self, now: float) -> None:
         slept = now - max(self._last, self.wake_at)
         if slept > self.rules.slept and self._choosing is None:
@@ -113,13 +110,14 @@ class AgentProtocol:
             why = self._refusal or f"no world of run {self._run!r} answered within {self.rules.join:g} s"
             self._end(ev.End(ev.Ending.FAILED, why), out)
             return
+        if self.state != AgentState.REOPENING and now - self._heard_at >= self.rules.silence:
+            self._reopen(now, out)
+            return
         if now >= self._answer_by:
             self._ask_at, self._answer_by = now, math.inf
         if now >= self._ask_at and self._asked is not None:
             self._put_question(now, out)
-        if self.state in (AgentState.JOINING, AgentState.SERVING) and now - self._heard_at >= self.rules.silence:
-            self._reopen(now, out)
-        elif now >= self._hello_at:
+        if now >= self._hello_at:
             self._speak(now, out)
 
     def _next_wake(self) -> float:
@@ -128,7 +126,7 @@ class AgentProtocol:
         times = [self._ask_at, self._answer_by, self._hello_at]
         if self.state != AgentState.SERVING:
             times.append(self._join_by)
-        if self.state in (AgentState.JOINING, AgentState.SERVING):
+        if self.state != AgentState.REOPENING:
             times.append(self._heard_at + self.rules.silence)
         return min(times)
 
@@ -152,7 +150,9 @@ class AgentProtocol:
     def _reopen(self, now: float, out: list[ev.Effect]) -> None:
         """The world lives, or this session is deaf: only a new session can tell."""
         self.counts["reopened"] += 1
-        self.state, self._join_by = AgentState.REOPENING, now + self.rules.join
+        if self.state == AgentState.SERVING:
+            self._join_by = now + self.rules.join
+        self.state = AgentState.REOPENING
         self._asked, self._ask_at, self._answer_by, self._hello_at = None, math.inf, math.inf, math.inf
         out.append(ev.Reopen())
 
@@ -185,7 +185,7 @@ class AgentProtocol:
             self._ask_at = now + self.rules.retry
             return
         key, _ = self._asked or ("", None)
-        kind = wire.Frame if key == keys.FRAME else wire.Snapshot
+        kind: type[wire.Frame | wire.Snapshot] = wire.Frame if key == keys.FRAME else wire.Snapshot
         try:
             said: wire.Frame | wire.Snapshot = wire.decode(payload, kind)
             if said.run != self._run or (kind is wire.Snapshot and said.epoch != self._epoch):
@@ -342,8 +342,6 @@ class AgentProtocol:
             return
         self._forget(out)
         self._seek(now, out)
-
-    # ---- deciding
 
     def _take(self, turn: wire.Turn, now: float, out: list[ev.Effect]) -> None:
         again = self._turn == turn

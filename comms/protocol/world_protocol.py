@@ -82,8 +82,6 @@ class WorldProtocol:
         )
         self.wake_at = now
 
-    # ---- the one way in
-
     def handle(self, event: ev.Event, now: float) -> list[ev.Effect]:
         """What to do about an event. `now` never goes back."""
         out: list[ev.Effect] = []
@@ -103,8 +101,6 @@ class WorldProtocol:
         self._last = now
         self.wake_at = self._next_wake()
         return out
-
-    # ---- time
 
     def _notice_sleep(self, now: float, out: list[ev.Effect]) -> None:
         """Move all deadlines by the time in which this process did not run: nobody else is to blame for it."""

@@ -246,8 +246,14 @@ def test_agent_whose_place_is_taken_gives_up_after_a_while():
     assert agent.at(6.0) == [ev.End(ev.Ending.FAILED, "another process decides")]
 
 
+def test_session_on_which_no_question_is_answered_is_opened_again():
+    agent = AgentDriver(join=False, silence=4.0)
+    assert agent.at(4.0) == [ev.Reopen()]
+    assert of(agent.at(4.5, ev.Reopened()), ev.Ask)
+
+
 def test_agent_without_a_world_gives_up_after_its_time():
-    agent = AgentDriver(join=False)
+    agent = AgentDriver(join=False, silence=100.0)
     agent.at(59.9)
     assert agent.protocol.ended is None
     assert of(agent.at(60.0), ev.End) == [ev.End(ev.Ending.FAILED, "no world of run 'run' answered within 60 s")]
