@@ -80,6 +80,7 @@ class Deployment:
 
     def __init__(self, options: DeployOptions) -> None:
         self.options = options
+        options.world.telemetry()
         simulator = options.world.simulator()
         self._n_agents = int(simulator.n_agents[0])
         self.policies = options.policies(self._n_agents)
@@ -287,6 +288,8 @@ def deploy(options: DeployOptions, progress: Progress | None = None) -> dict[str
     InvalidOptionError and InvalidFileError for what cannot be deployed, DeploymentError naming the process that
     failed. SIGINT, SIGTERM and SIGHUP end all processes and then this one, with 128 + n.
     """
+    import marl_sched.comms.transport.zenoh_session  # noqa: F401  (what is not installed is missed here, not in a child)
+
     started = time.monotonic()
     report: dict[str, Any] = {}
     try:

@@ -93,8 +93,7 @@ class AgentProtocol:
                 self._chosen(sequence, action, out)
             case ev.Interrupted(number):
                 self._end(ev.End(ev.Ending.INTERRUPTED, f"signal {number}"), out)
-        if self.ended is None:
-            self._pass_time(now, out)
+        self._pass_time(now, out)
         self._last = now
         self.wake_at = self._next_wake()
         return out
@@ -106,6 +105,8 @@ class AgentProtocol:
             self.counts["slept"] += 1
 
     def _pass_time(self, now: float, out: list[ev.Effect]) -> None:
+        if self.ended is not None:
+            return
         if now >= self._join_by and self.state != AgentState.SERVING:
             why = self._refusal or f"no world of run {self._run!r} answered within {self.rules.join:g} s"
             self._end(ev.End(ev.Ending.FAILED, why), out)
@@ -123,12 +124,9 @@ class AgentProtocol:
     def _next_wake(self) -> float:
         if self.ended is not None:
             return math.inf
-        times = [self._ask_at, self._answer_by, self._hello_at]
-        if self.state != AgentState.SERVING:
-            times.append(self._join_by)
-        if self.state != AgentState.REOPENING:
-            times.append(self._heard_at + self.rules.silence)
-        return min(times)
+        join_by = math.inf if self.state == AgentState.SERVING else self._join_by
+        silent_at = math.inf if self.state == AgentState.REOPENING else self._heard_at + self.rules.silence
+        return min(self._ask_at, self._answer_by, self._hello_at, join_by, silent_at)
 
     def _speak(self, now: float, out: list[ev.Effect]) -> None:
         """Say hello until welcomed, then once a heartbeat that this agent lives."""
@@ -144,8 +142,6 @@ class AgentProtocol:
             self._hello_at = math.inf
             return
         out.append(ev.Put(self._keys.hello(self._agent), said, control=True))
-
-    # ---- finding the world
 
     def _reopen(self, now: float, out: list[ev.Effect]) -> None:
         """The world lives, or this session is deaf: only a new session can tell."""
@@ -254,35 +250,37 @@ class AgentProtocol:
             out.append(ev.Withdraw(self._announced))
         self._announced, self.incarnation, self._turn, self._sent = "", "", None, None
 
-    # ---- what is heard
+    def _read(self, event: ev.Received, out: list[ev.Effect]) -> wire.Message | None:
+        """The message that came, None for one that cannot be read, which is counted."""
+        try:
+            if event.key == keys.CLOCK:
+                return wire.decode(event.payload, wire.Clock)
+            if event.key == self._keys.turn(self._agent):
+                said: wire.ToAgent = wire.decode(event.payload, wire.Turn, wire.Welcome, wire.Fenced, wire.Refused)
+                return said
+            news = wire.decode(event.payload, wire.News)
+            if news.channel != event.key:
+                raise InvalidMessageError(f"the state of {news.channel[:60]} came by it")
+            return news
+        except InvalidMessageError as error:
+            self._drop(event.key, error, out)
+            return None
 
     def _hear(self, event: ev.Received, now: float, out: list[ev.Effect]) -> None:
         self.counts["heard"] += 1
-        try:
-            if event.key == keys.CLOCK:
-                said: wire.Message = wire.decode(event.payload, wire.Clock)
-            elif event.key == self._keys.turn(self._agent):
-                said = wire.decode(event.payload, wire.Turn, wire.Welcome, wire.Fenced, wire.Refused)
-            else:
-                said = wire.decode(event.payload, wire.News)
-                if said.channel != event.key:
-                    raise InvalidMessageError(f"the state of {said.channel[:60]} came by it")
-        except InvalidMessageError as error:
-            self._drop(event.key, error, out)
+        said = self._read(event, out)
+        if said is None:
             return
         if said.run != self._run or said.epoch != self._epoch:
             self._hear_other_epoch(said, now, out)
             return
-        if isinstance(said, wire.News):
-            self._hear_news(said, now, out)
-            return
-        if isinstance(said, wire.Refused):
-            self.counts["refused"] += 1
-            if self.state == AgentState.JOINING:
-                self._end(ev.End(ev.Ending.FAILED, said.reason), out)
-            return
-        self._heard_at = now
+        if not isinstance(said, wire.News | wire.Refused):
+            self._heard_at = now
         match said:
+            case wire.News():
+                self._hear_news(said, now, out)
+            case wire.Refused():
+                self._refused(said, out)
             case wire.Clock(tick=tick, phase=phase):
                 self._tick = tick
                 if phase == "over":
@@ -296,6 +294,11 @@ class AgentProtocol:
             case wire.Turn():
                 self._welcomed(now)
                 self._take(said, now, out)
+
+    def _refused(self, said: wire.Refused, out: list[ev.Effect]) -> None:
+        self.counts["refused"] += 1
+        if self.state == AgentState.JOINING:
+            self._end(ev.End(ev.Ending.FAILED, said.reason), out)
 
     def _hear_other_epoch(self, said: wire.Message, now: float, out: list[ev.Effect]) -> None:
         """Another world may have taken over; ask, at most once a second, instead of believing it."""

@@ -241,8 +241,8 @@ def test_part_of_the_team_is_started_here_and_the_rest_elsewhere():
 
 
 def test_unknown_policy_and_agent_are_refused_before_anything_starts():
-    with pytest.raises(UnknownNameError, match="unknown scheduler 'conditoin'; did you mean 'condition'"):
-        Deployment(DeployOptions(world=world(), policy="conditoin"))
+    with pytest.raises(UnknownNameError, match="unknown scheduler 'conditionn'; did you mean 'condition'"):
+        Deployment(DeployOptions(world=world(), policy="conditionn"))
     with pytest.raises(UnknownNameError, match=r"'crew_9'.*Known: crew_0, .*crew_6"):
         Deployment(DeployOptions(world=world(), policy="random", agent_policies={"crew_9": "random"}))
     with pytest.raises(UnknownNameError, match="'crew_9'"):
@@ -271,7 +271,7 @@ def test_port_in_use_is_one_line_and_exit_code_2():
         ("world", {"env": "airme", "huors": 3}, "unknown huors"),
         ("world", {"env": "airmee"}, "did you mean 'airme'"),
         ("world", {"env": "airme", "scale": "tiny"}, "unknown scale of airme 'tiny'"),
-        ("world", {"env": "airme", "view": "lokal"}, "did you mean 'local'"),
+        ("world", {"env": "airme", "view": "locall"}, "did you mean 'local'"),
         ("world", {"env": "airme", "view": "full", "view_options": {"reach": 1}}, "reach"),
         ("world", {"env": "airme", "listen": "127.0.0.1:7447"}, "expected an endpoint such as tcp/127.0.0.1:7447"),
         ("world", {"env": "airme", "deadline": 0}, "deadline: expected a number > 0"),
