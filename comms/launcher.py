@@ -30,7 +30,7 @@ from marl_sched.comms.process import SIGNALS
 from marl_sched.comms.protocol.events import Ending, ExitCode
 from marl_sched.comms.transport.endpoints import settle_port
 from marl_sched.domain import Domain
-from marl_sched.errors import DeploymentError
+from marl_sched.errors import DeploymentError, InvalidFileError, InvalidOptionError, UnknownNameError
 from marl_sched.files import read_json, write_json
 
 WORLD = "world"
@@ -291,7 +291,7 @@ def deploy(options: DeployOptions, progress: Progress | None = None) -> dict[str
     import marl_sched.comms.transport.zenoh_session  # noqa: F401  (what is not installed is missed here, not in a child)
 
     started = time.monotonic()
-    report: dict[str, Any] = {}
+    report: dict[str, Any] | None = None
     try:
         with _signals() as stopped, Deployment(options) as deployment:
             stopped.waiting = True
@@ -299,13 +299,16 @@ def deploy(options: DeployOptions, progress: Progress | None = None) -> dict[str
     except SystemExit as end:
         report = _no_report(options, Ending.INTERRUPTED, f"signal {int(end.code or 0) - 128}", int(end.code or 0))
         raise
+    except (InvalidOptionError, InvalidFileError, UnknownNameError):
+        raise  # nothing was started
     except Exception as error:
         report = _no_report(options, Ending.FAILED, str(error), int(ExitCode.USER_ERROR))
         raise
     finally:
-        report["seconds_in_all"] = round(time.monotonic() - started, 3)
-        if options.world.report:
-            write_json(options.world.report, report)
+        if report is not None:
+            report["seconds_in_all"] = round(time.monotonic() - started, 3)
+            if options.world.report:
+                write_json(options.world.report, report)
     if report["ending"]["kind"] == Ending.INTERRUPTED and stopped.number is not None:
         sys.exit(128 + stopped.number)
     return report

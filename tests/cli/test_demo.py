@@ -44,7 +44,7 @@ def test_the_demo_deploys_compares_and_draws(run, tmp_path, monkeypatch):
     assert sorted(path.name for path in tmp_path.iterdir()) == names
     deployed = json.loads((tmp_path / "deployment.json").read_text())
     assert len(deployed["agents"]) == 7
-    assert deployed["hours"] == len(deployed["profit"]) == 48
+    assert deployed["time"] == len(deployed["profit"]) == 48
     assert deployed["deaths"] == []
     assert deployed["view"]["visible_share"] <= 0.45
     local = json.loads((tmp_path / "results-local-view.json").read_text())
