@@ -82,11 +82,11 @@ def test_actions_keep_their_names_and_action_0_stays_first():
 @pytest.mark.parametrize(("domain", "turns"), [("airme", 40), ("murse", 7)])
 def test_blocks_of_any_size_give_the_logits_of_the_whole(domain: str, turns: int, block_nodes: int, monkeypatch):
     graph, observation = played(domain, turns)
-    network = network_for(graph, torch.float32)
+    network = network_for(graph, torch.float64)
     monkeypatch.setattr(batches, "BLOCK_NODES", block_nodes)
     whole, ours = network(observation), logits_in_blocks(network, observation, network.weights())
     assert ours.shape == whole.shape
-    torch.testing.assert_close(ours, whole, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(ours, whole, rtol=1e-12, atol=1e-12)
     assert torch.equal(ours.argmax(1), whole.argmax(1))
 
 

@@ -24,6 +24,14 @@ def network_for(graph: GraphSpec, seed: int = 0, **sizes: int) -> HetGATNetwork:
     return network
 
 
+def doubles(observation: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """The observation in float64, in which sums of a few thousand terms agree to 1e-12 in whatever order they are taken.
+
+    Exact claims are held in float64: the order of a float32 sum, and so its last digits, differ between processors.
+    """
+    return {name: values.double() if values.is_floating_point() else values for name, values in observation.items()}
+
+
 def critic_for(graph: GraphSpec, **options: int) -> HetGATCritic:
     """A critic whose last layers are not zero, as they are before training."""
     torch.manual_seed(1)
@@ -102,18 +110,18 @@ def test_a_visible_node_does_change_the_logits_of_others(graph, sizes, observe):
 
 @pytest.mark.parametrize("extra", [1, 13])
 def test_padding_changes_nothing(graph, sizes, observe, extra: int):
-    observation = observe(graph, sizes, batch=5)
+    observation = doubles(observe(graph, sizes, batch=5))
     larger = padded(graph, observation, extra)
-    network, critic = network_for(graph), critic_for(graph)
+    network, critic = network_for(graph).double(), critic_for(graph).double()
     n_actions = sizes[graph.decision_of]
     logits = network(larger)
-    torch.testing.assert_close(logits[:, :n_actions], network(observation), rtol=1e-6, atol=1e-6)
-    assert (logits[:, n_actions:] == torch.finfo(torch.float32).min).all()
-    torch.testing.assert_close(critic(larger), critic(observation), rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(logits[:, :n_actions], network(observation), rtol=1e-12, atol=1e-12)
+    assert (logits[:, n_actions:] == torch.finfo(torch.float64).min).all()
+    torch.testing.assert_close(critic(larger), critic(observation), rtol=1e-12, atol=1e-12)
 
 
 def test_permuting_planes_permutes_decisions_and_nothing_else(fleet, observe):
-    observation = observe(fleet, {"plane": 9, "crew": 4}, batch=5)
+    observation = doubles(observe(fleet, {"plane": 9, "crew": 4}, batch=5))
     order = torch.tensor([0, 4, 2, 8, 1, 3, 7, 5, 6])
     moved = dict(observation)
     for name in ("plane", "plane_mask", ACTION_MASK):
@@ -121,18 +129,18 @@ def test_permuting_planes_permutes_decisions_and_nothing_else(fleet, observe):
     place = torch.argsort(order)
     repairing = observation["repairing"]
     moved["repairing"] = torch.where(repairing >= 0, place[repairing.clamp(min=0)], -1)
-    network, critic = network_for(fleet), critic_for(fleet)
-    torch.testing.assert_close(network(moved), network(observation)[:, order], rtol=1e-6, atol=1e-6)
-    torch.testing.assert_close(critic(moved), critic(observation), rtol=1e-5, atol=1e-5)
+    network, critic = network_for(fleet).double(), critic_for(fleet).double()
+    torch.testing.assert_close(network(moved), network(observation)[:, order], rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(critic(moved), critic(observation), rtol=1e-12, atol=1e-12)
 
 
 def test_a_row_does_not_depend_on_the_rest_of_its_batch(graph, sizes, observe):
-    observation = observe(graph, sizes, batch=6)
-    network = network_for(graph)
+    observation = doubles(observe(graph, sizes, batch=6))
+    network = network_for(graph).double()
     together = network(observation)
     for b in range(6):
         alone = network({name: values[b : b + 1] for name, values in observation.items()})
-        torch.testing.assert_close(alone[0], together[b], rtol=1e-5, atol=1e-5)
+        torch.testing.assert_close(alone[0], together[b], rtol=1e-12, atol=1e-12)
 
 
 def test_the_same_weights_run_on_small_and_large(graph, sizes, observe):
