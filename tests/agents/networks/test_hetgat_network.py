@@ -25,7 +25,7 @@ def network_for(graph: GraphSpec, seed: int = 0, **sizes: int) -> HetGATNetwork:
 
 
 def doubles(observation: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """The observation in float64, in which sums of a few thousand terms agree to 1e-12 in whatever order they are taken.
+    """The observation in float64, in which sums of some thousand terms agree to 1e-12 in whatever order they are taken.
 
     Exact claims are held in float64: the order of a float32 sum, and so its last digits, differ between processors.
     """
