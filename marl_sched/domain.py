@@ -159,6 +159,8 @@ class Domain:
             every generated instance can be solved.
         impossibilities: instance -> why no schedule of it can be feasible, a sentence each; empty if none is known.
         demo: what `marl-sched demo` shows; None: nothing.
+        pressing: observation -> the legal actions, bool (B, n_actions), one of which a greedy policy takes before it
+            does nothing; None: there are none such.
         legend: what the colours of the `rgb_array` picture mean, meaning -> RGB in 0 .. 255; None: it needs none.
         band: what a band of the `rgb_array` picture is and how many pixels high, such as ("plane", 4); None: the
             picture brings axes of its own.
@@ -190,6 +192,7 @@ class Domain:
     generate_accepted: Callable[[str, np.random.Generator, Callable[[Any], bool]], Any] | None = None
     impossibilities: Callable[[Any], list[str]] = _none_known
     demo: Demo | None = None
+    pressing: Callable[[Mapping[str, np.ndarray]], np.ndarray] | None = None
     legend: Mapping[str, Sequence[int]] | None = None
     band: tuple[str, int] | None = None
 

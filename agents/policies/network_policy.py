@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple, get_args
 
@@ -16,6 +17,7 @@ from marl_sched.agents.networks.batches import logits_in_blocks
 from marl_sched.agents.networks.network import PolicyNetwork
 from marl_sched.agents.policies.cards import Mode, PolicyCard, check_graph
 from marl_sched.agents.policies.checkpoint import load_network
+from marl_sched.domain import domain_names, get_domain
 from marl_sched.errors import InvalidOptionError
 from marl_sched.graph import ACTION_MASK, STATE, TIME, VISIBLE_SHARE, GraphSpec
 from marl_sched.simulation import TurnSimulator
@@ -41,7 +43,8 @@ class NetworkPolicy(ObservationScheduler):
     Args:
         network: on any device; the copy is on the CPU.
         name: as users type it.
-        mode: `greedy` takes the most probable action, ties to the lowest index; `sample` picks by inverse
+        mode: `greedy` takes the most probable action, ties to the lowest index, and never does nothing while an
+            action is pressing (see Domain.pressing; its domain is the card's); `sample` picks by inverse
             distribution with the uniform that it is given. `one_pass` samples for all agents of a decision epoch from
             what the first of them saw, without the actions that are taken by then: how the dissertation plays what was
             trained with one decision an hour (scheme Single, section 6.3.1). On a lone observation it samples.
@@ -67,6 +70,13 @@ class NetworkPolicy(ObservationScheduler):
         self._n_features[STATE] = len(self.graph.state_features)
         self._checked: GraphSpec | None = None
         self._first = _FirstLogits(np.zeros(0, np.int64), np.zeros((0, 0), np.float32))
+
+    @cached_property
+    def _pressing(self) -> Callable[[Observation], np.ndarray] | None:
+        """What its domain says must not wait; None for a network without a card or of a domain that is not there."""
+        if self.card is None or self.card.domain not in domain_names():
+            return None
+        return get_domain(self.card.domain).pressing
 
     @classmethod
     def load(cls, path: str | Path, *, mode: Mode | None = None, graph: GraphSpec | None = None) -> NetworkPolicy:
@@ -101,7 +111,7 @@ class NetworkPolicy(ObservationScheduler):
             one_pass = self.mode == "one_pass"
             logits = self._of_epoch(simulator, rows, observation) if one_pass else self.logits(observation)
             noise = simulator.policy_noise(simulator.acting)[rows] if self.samples else np.zeros(len(rows))
-            actions[rows] = self._pick(logits, noise)
+            actions[rows] = self._pick(logits, noise, observation)
         return actions
 
     def _of_epoch(self, simulator: TurnSimulator, rows: np.ndarray, observation: Observation) -> np.ndarray:
@@ -123,10 +133,16 @@ class NetworkPolicy(ObservationScheduler):
 
     def choose(self, observation: Observation, uniform: np.ndarray) -> np.ndarray:
         """Actions int64 (B,) from batched observations and uniforms float64 (B,) in [0, 1)."""
-        return self._pick(self.logits(observation), uniform)
+        return self._pick(self.logits(observation), uniform, observation)
 
-    def _pick(self, logits: np.ndarray, uniform: np.ndarray) -> np.ndarray:
-        return inverse_distribution(logits, uniform) if self.samples else logits.argmax(1)
+    def _pick(self, logits: np.ndarray, uniform: np.ndarray, observation: Observation) -> np.ndarray:
+        if self.samples:
+            return inverse_distribution(logits, uniform)
+        actions = logits.argmax(1)
+        if self._pressing is None or actions.all():
+            return actions
+        urgent = np.where(self._pressing(observation), logits, -np.inf)
+        return np.where((actions == 0) & (urgent.max(1) > -np.inf), urgent.argmax(1), actions)
 
     @torch.inference_mode()
     def logits(self, observation: Observation) -> np.ndarray:

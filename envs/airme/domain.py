@@ -5,6 +5,7 @@ from __future__ import annotations
 from marl_sched.domain import Demo, Domain
 from marl_sched.envs.airme import render
 from marl_sched.envs.airme.dynamics import OBJECTIVES
+from marl_sched.envs.airme.graph import pressing
 from marl_sched.envs.airme.instance import SCALES, AirmeInstance, decode, generate, load
 from marl_sched.envs.airme.simulator import DEFAULT_HORIZON, AirmeSimulator
 from marl_sched.envs.airme.views import VIEWS
@@ -38,6 +39,7 @@ AIRME = Domain(
         local_rules=("condition", "preventive-first"),
         central_rules=("corrective", "condition", "model-based", "preventive-first"),
     ),
+    pressing=pressing,
     legend=render.LEGEND,
     band=("plane", render.CELL),
 )

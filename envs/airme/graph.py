@@ -6,6 +6,7 @@ so that a policy meets the same range of values at every scale.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -50,6 +51,19 @@ def graph_spec(n_types: int) -> GraphSpec:
         ),
         decision_of="plane",
     )
+
+
+_BROKEN, _AGE = _PLANE.index("broken"), _PLANE.index("age_hours/10")
+
+
+def pressing(observation: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Broken planes that a crew sees as they are and that nobody has in hand, bool (B, P + 1).
+
+    Every plane has a home crew, which sees it as it is. If a crew does not idle while it could serve one of these, no
+    plane stays broken for ever beside a crew with nothing to do.
+    """
+    plane = observation["plane"]
+    return (plane[..., _BROKEN] > 0) & (plane[..., _AGE] == 0) & (observation["action_mask"] > 0)
 
 
 class Arrays(NamedTuple):

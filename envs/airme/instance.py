@@ -18,7 +18,8 @@ from marl_sched.structs import convert
 
 SCHEMA = 1
 MOST_INCOME = 1e9  # sums over a fleet stay finite
-MOST = 1_000_000  # counters index failure tables and crews size arrays: beyond this a file is wrong, not large
+MOST = 1_000_000  # of hours and landings, which index failure tables: beyond this a file is wrong, not large
+MOST_PLANES = 10_000  # and crews: an hour of such a fleet takes milliseconds, its observation megabytes
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -47,8 +48,9 @@ class AirmeInstance:
             raise InvalidOptionError(f"AirME instance: {problem}")
 
     def _problem(self) -> str:
-        if self.n_crews < 1:
-            return f"n_crews: expected at least 1, got {self.n_crews}"
+        for name, count in (("n_crews", self.n_crews), ("planes", self.n_planes)):
+            if not 1 <= count <= MOST_PLANES:
+                return f"{name}: expected 1 to {MOST_PLANES}, got {count}"
         for name in _ARRAYS:
             if getattr(self, name).shape != (self.n_planes,):
                 return f"{name}: expected one value per plane ({self.n_planes}), got {getattr(self, name).shape}"
@@ -61,7 +63,7 @@ class AirmeInstance:
             if not good.all():
                 p = int(np.flatnonzero(~good)[0])
                 return f"planes[{p}].{name}: expected {expected}, got {getattr(self, name)[p]}"
-        return "" if self.n_planes else "planes: expected at least one"
+        return ""
 
     @property
     def n_planes(self) -> int:
@@ -186,9 +188,11 @@ class _File(Struct, forbid_unknown_fields=True):
 
     schema: Annotated[Literal[1], Meta(description=f"{SCHEMA}")]
     env: Annotated[Literal["airme"], Meta(description="'airme'")]
-    n_crews: Annotated[int, Meta(ge=1, le=MOST, description=f"an integer in [1, {MOST}]")]
+    n_crews: Annotated[int, Meta(ge=1, le=MOST_PLANES, description=f"an integer in [1, {MOST_PLANES}]")]
     types: Annotated[list[_Type], Meta(min_length=1, description="a list that is not empty")]
-    planes: Annotated[list[_Plane], Meta(min_length=1, description="a list that is not empty")]
+    planes: Annotated[
+        list[_Plane], Meta(min_length=1, max_length=MOST_PLANES, description=f"a list of 1 to {MOST_PLANES} planes")
+    ]
 
 
 def load(path: str | Path) -> AirmeInstance:

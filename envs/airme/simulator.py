@@ -9,7 +9,7 @@ import numpy as np
 
 from marl_sched.compiled import entry
 from marl_sched.envs.airme import dynamics, graph
-from marl_sched.envs.airme.aircraft import FailureModel, failure_table
+from marl_sched.envs.airme.aircraft import PUBLISHED_TYPES, AircraftType, FailureModel, failure_table
 from marl_sched.envs.airme.instance import SCALES, AirmeInstance
 from marl_sched.envs.airme.views import FullView, View
 from marl_sched.errors import IllegalActionError, InvalidOptionError, require, require_integer
@@ -26,7 +26,7 @@ class AirmeSimulator(TurnSimulator):
     `limits` int64 (B, 3) holds (reach, comm, staleness) of each row's running episode.
 
     Args:
-        instances: one AirmeInstance per row, all with the same aircraft types.
+        instances: one AirmeInstance per row. Types are told apart by their names; see `fleet_types`.
         view: what acting crews see.
         objective: "profit", "revenue" or "availability", the reward of an hour.
         horizon: hours of an episode, its truncation.
@@ -59,7 +59,7 @@ class AirmeSimulator(TurnSimulator):
     ) -> None:
         self._check(instances, objective, horizon, pad, scheme, stop_share)
         self.instances = list(instances)
-        self.types = self.instances[0].types
+        self.types = fleet_types(self.instances)
         self.view = view if view is not None else FullView()
         self.objective, self.scheme, self.horizon, self.failure = objective, scheme, horizon, failure
         self.batch = len(self.instances)
@@ -148,8 +148,13 @@ class AirmeSimulator(TurnSimulator):
 
     def _start(self, b: int) -> None:
         instance, state = self.instances[b], self.state
-        if instance.types != self.types:
-            raise InvalidOptionError(f"instances[{b}]: aircraft types differ from those of the other rows")
+        known = [kind.name for kind in self.types]
+        if not _are_known(instance, self.types):
+            raise InvalidOptionError(
+                f"instances[{b}]: expected aircraft types of {', '.join(known)} as the simulator was made with, "
+                f"got {', '.join(kind.name for kind in instance.types)}"
+            )
+        kinds = np.array([known.index(kind.name) for kind in instance.types])
         n_planes, n_crews = instance.n_planes, instance.n_crews
         if n_planes >= self.max_actions or n_crews > self.max_agents:
             raise InvalidOptionError(
@@ -159,7 +164,8 @@ class AirmeSimulator(TurnSimulator):
         planes = state.planes[b]
         planes[:] = 0
         planes["crew"] = planes["chosen"] = -1
-        for name in ("kind", "income", "hours", "landings", "broken"):
+        planes["kind"][1 : n_planes + 1] = kinds[instance.kind]
+        for name in ("income", "hours", "landings", "broken"):
             planes[name][1 : n_planes + 1] = getattr(instance, name)
         state.crews[b] = 0
         state.crews["choice"][b] = dynamics.UNDECIDED
@@ -181,7 +187,7 @@ class AirmeSimulator(TurnSimulator):
 
     def load_state(self, saved: SavedState) -> None:
         """Go back to a saved state; see TurnSimulator.load_state. The aircraft types must be this simulator's."""
-        if any(instance.types != self.types for instance in saved.instances):
+        if not all(_are_known(instance, self.types) for instance in saved.instances):
             raise InvalidOptionError("load_state: the saved fleets have other aircraft types than this simulator's")
         super().load_state(saved)
 
@@ -234,6 +240,27 @@ class AirmeSimulator(TurnSimulator):
     def snapshot(self, row: int) -> dict[str, np.ndarray]:
         """Copies of a row's books, planes and crews."""
         return {name: getattr(self.state, name)[row].copy() for name in ("rows", "planes", "crews")}
+
+
+def fleet_types(instances: Sequence[AirmeInstance]) -> tuple[AircraftType, ...]:
+    """The aircraft types of several fleets, each once: in this order observations hold their one-hot.
+
+    A type is known by its name, wherever it stands in a file. Where any of the published ones flies both are there,
+    in their published order, so that what was trained on the two finds them where they were; all others follow by
+    name. Raises InvalidOptionError for a name that stands for two different types.
+    """
+    found: dict[str, AircraftType] = {}
+    for b, instance in enumerate(instances):
+        for kind in instance.types:
+            if found.setdefault(kind.name, kind) != kind:
+                raise InvalidOptionError(f"instances[{b}]: aircraft type {kind.name!r} is another one elsewhere")
+    published = {kind.name: kind for kind in PUBLISHED_TYPES}
+    first = [found.get(name, kind) for name, kind in published.items()] if found.keys() & published.keys() else []
+    return (*first, *(found[name] for name in sorted(found.keys() - published.keys())))
+
+
+def _are_known(instance: AirmeInstance, types: Sequence[AircraftType]) -> bool:
+    return set(instance.types) <= set(types)
 
 
 def _new_state(batch: int, planes: int, crews: int, horizon: int, staleness: int, timeline: bool) -> dynamics.State:

@@ -253,10 +253,8 @@ class TestReset:
                 alone.play_hour(hour[b : b + 1, : instance.n_crews])
             assert (alone.state.series[0] == batch.state.series[b]).all()
 
-    def test_types_must_be_alike_and_instances_fit_the_padding(self) -> None:
+    def test_instances_fit_the_padding(self) -> None:
         small, large = (generate(scale, np.random.default_rng(0)) for scale in ("small", "large"))
-        with pytest.raises(InvalidOptionError, match="aircraft types differ"):
-            AirmeSimulator([small, fleet((STEADY, 1.0, 0, 0, False))])
         with pytest.raises(InvalidOptionError, match="exceed the padding"):
             AirmeSimulator([large], pad="small")
         with pytest.raises(InvalidOptionError, match="episodes: expected one per chosen row"):
