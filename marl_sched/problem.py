@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 SCHEMA = 1
 COUNT, EPISODES = 100, 10  # what `marl-sched evaluate` plays unless told otherwise
 MOST = 2**31 - 1
+MOST_INSTANCES = 100_000  # drawn at once: seconds and some hundred MB of small fleets
 
 
 @dataclass(frozen=True, init=False)
@@ -89,7 +90,7 @@ class Problem:
         if given is None:
             scale = domain.require_scale(next(iter(domain.scales)) if scale is None else scale)
             pad = scale if pad is None else pad
-            count = require_integer("count", COUNT if count is None else count, 1, MOST)
+            count = require_integer("count", COUNT if count is None else count, 1, MOST_INSTANCES)
         values = {
             "domain": domain,
             "scale": scale,

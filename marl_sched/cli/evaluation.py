@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from marl_sched.cli import options
+from marl_sched.cli.compilation import told_of_compilation
 from marl_sched.cli.grouped import DOMAIN_OPTIONS, takes
 from marl_sched.cli.selection import Resolved, Selection
 
@@ -82,7 +83,8 @@ def play(resolved: Resolved, baseline: str | None) -> dict[str, Any]:
     keep_freed_memory()
     domain = resolved.problem.domain
     console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+    bar = Progress(console=console, transient=True, disable=not console.is_terminal)
+    with told_of_compilation(), bar as progress:
         tasks: dict[str, Any] = {}
 
         def tell(name: str, done: float) -> None:
@@ -115,7 +117,8 @@ def bench(
     from marl_sched.train.bench import bench as measure
 
     options.check_output(json)
-    figures = measure(get_domain(env), repeats=repeats, batch=batch)
+    with told_of_compilation():
+        figures = measure(get_domain(env), repeats=repeats, batch=batch)
     if json is not None:
         write_json(json, figures)
     print_bench(figures)

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from marl_sched.cli import options
+from marl_sched.cli.compilation import told_of_compilation
 from marl_sched.errors import InvalidOptionError
 
 EXPORT_SEED = 90_002  # of instances that neither training nor validation draws
@@ -29,14 +30,16 @@ def train(
     """Train a policy as configs/train.yaml says, with these overrides."""
     from marl_sched.train.run import train_from_overrides
 
-    typer.echo(train_from_overrides(overrides or []))
+    with told_of_compilation():
+        typer.echo(train_from_overrides(overrides or []))
 
 
 def resume(run_dir: Annotated[Path, typer.Argument(metavar="RUN_DIR", help="The folder of a run.")]) -> None:
     """Go on with a training run exactly where its last checkpoint left it."""
     from marl_sched.train.run import resume as go_on
 
-    typer.echo(go_on(run_dir))
+    with told_of_compilation():
+        typer.echo(go_on(run_dir))
 
 
 def export(
