@@ -25,6 +25,8 @@ from pathlib import Path
 from typing import Any
 
 from marl_sched.comms.process import SIGNALS, call, end_with, leave, parse_options
+from marl_sched.comms.protocol.events import ExitCode
+from marl_sched.errors import MarlSchedError
 
 GRACE = 4.0  # seconds that processes have to end when asked to, before they are killed
 TICK = 0.05
@@ -141,7 +143,7 @@ def warm_up(world: Any, policies: list[str]) -> None:
     """Import, load from disk and compile what the processes are about to use."""
     import numpy as np
 
-    from marl_sched.agents.registry import create_scheduler
+    from marl_sched.comms.agent import load_policy
     from marl_sched.comms.plant import SimulatedPlant
 
     plant = SimulatedPlant(world.domain(), world.telemetry(), world.simulator())
@@ -150,9 +152,8 @@ def warm_up(world: Any, policies: list[str]) -> None:
     for channel, payload in state.changed.items():
         if channel in local.channels:
             local.hear(channel, payload)
-    local.observe()
     for policy in policies:
-        create_scheduler(policy, plant.domain)
+        load_policy(policy, plant.domain).choose(local.observe(), np.array([0.5]))
     plant.simulator.observe(plant.simulator.acting)
     plant.simulator.step(np.zeros(1, np.int64))
 
@@ -165,7 +166,11 @@ def main() -> None:
     from marl_sched.comms.transport import zenoh_session  # noqa: F401  (imported once, for all)
 
     asked = json.loads(sys.argv[1])
-    warm_up(parse_options(json.dumps(asked["world"]), WorldOptions), asked["policies"])
+    try:
+        warm_up(parse_options(json.dumps(asked["world"]), WorldOptions), asked["policies"])
+    except MarlSchedError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(ExitCode.USER_ERROR)
     ForkServer(
         {
             "world": (WorldOptions, world.serve, world.exit_code_of),

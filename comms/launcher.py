@@ -149,7 +149,7 @@ class Deployment:
             self._server.stdin.write(json.dumps(order).encode() + b"\n")
             self._server.stdin.flush()
         except BrokenPipeError as error:
-            raise DeploymentError(f"the fork server has ended: {self._server_complaint()}") from error
+            raise DeploymentError(f"no process could be started: {self._server_complaint()}") from error
 
     def _server_complaint(self) -> str:
         return Child("fork server", self.folder / "fork_server.log", lambda: None).complaint()
@@ -195,7 +195,7 @@ class Deployment:
                 break
             timeout = 0.0
             if said is None:
-                raise DeploymentError(f"the fork server has ended: {self._server_complaint()}")
+                raise DeploymentError(f"no process could be started: {self._server_complaint()}")
             self._take_in(said)
         now = time.monotonic()
         for child in self.children.values():
