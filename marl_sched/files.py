@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import shutil
+import stat
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,29 +16,80 @@ from typing import Any
 
 from marl_sched.errors import InvalidFileError
 
+STDOUT = Path("-")
+"""The path that stands for standard output."""
+_OPEN_FILE = re.compile(r"/dev/(stdout|stderr)|(?:/dev|/proc/self)/fd/(\d+)")
+_STANDARD = {"stdout": 1, "stderr": 2}
+
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """A temporary path beside `path` that takes its place when the block ends well, and vanishes otherwise."""
+    """A temporary path that takes the place of the file `path` when the block ends well, and vanishes otherwise.
+
+    The file appears whole or not at all, with the permissions it had. A link stays, and what it leads to is replaced.
+    What is no plain file (a device, a pipe) and what lies in /dev or /proc, which may be somebody's open file, is
+    written through instead. Raises OSError with the name of the file, where the disk is full too.
+    """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=path.suffix, dir=path.parent)
+    through = _is_written_through(path)
+    target = path if through else path.resolve()
+    if not through:
+        target.parent.mkdir(parents=True, exist_ok=True)
+    folder = None if through else target.parent
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=path.suffix, dir=folder)
     os.close(handle)
     temporary = Path(name)
     try:
         yield temporary
-        umask = os.umask(0)
-        os.umask(umask)
-        temporary.chmod(0o666 & ~umask)
-        temporary.replace(path)
+        if through:
+            _append(temporary, path)
+        else:
+            temporary.chmod(_permissions(target))
+            temporary.replace(target)
+    except OSError as error:
+        if error.errno is None or error.filename not in (None, str(temporary)):
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         temporary.unlink(missing_ok=True)
 
 
+def _is_written_through(path: Path) -> bool:
+    if path.absolute().parts[1:2] in (("dev",), ("proc",)):
+        return True
+    return path.exists() and not path.is_file() and not path.is_dir()
+
+
+def _permissions(target: Path) -> int:
+    """Those that the file has, or that the umask grants to a new one."""
+    if target.exists():
+        return stat.S_IMODE(target.stat().st_mode)
+    umask = os.umask(0)
+    os.umask(umask)
+    return 0o666 & ~umask
+
+
+def _append(source: Path, path: Path) -> None:
+    """Write a file's bytes to a device or pipe, or to what this process has open under that name."""
+    named = _OPEN_FILE.fullmatch(str(path))
+    if named:
+        sys.stdout.flush()
+        sys.stderr.flush()
+    # Another opening of an open file would have a position of its own, and the two would overwrite each other.
+    opened = os.dup(_STANDARD.get(named[1]) or int(named[2])) if named else path
+    with source.open("rb") as file, open(opened, "ab") as out:
+        shutil.copyfileobj(file, out)
+
+
 def write_json(path: str | Path, data: Any) -> None:
-    """Write `data` as indented JSON, beside and renamed."""
+    """Write `data` as indented JSON, whole or not at all; the path `-` is standard output."""
+    text = json.dumps(data, indent=2, allow_nan=False) + "\n"
+    if Path(path) == STDOUT:
+        sys.stdout.write(text)
+        sys.stdout.flush()
+        return
     with replacing(path) as temporary:
-        temporary.write_text(json.dumps(data, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8")
 
 
 def read_json(path: str | Path) -> Any:

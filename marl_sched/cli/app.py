@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import codecs
+import io
 import sys
+import unicodedata
 from collections.abc import Sequence
 from typing import Annotated, Any
 
@@ -25,6 +28,21 @@ for group in (problems, evaluation, pages, bound, training, deployment, demo, in
 # Newer typer ships click inside itself, older ones depend on it: the base of all its errors of usage is reached
 # through the one that both export.
 _UsageError: Any = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
+
+# How letters that a terminal may lack are written in ASCII: plus-minus, times, dashes, ellipsis, sharp s, comparisons,
+# lines of tables and progress bars.
+_PLAIN = {
+    "\u00b1": "+/-",
+    "\u00d7": "x",
+    "\u2013": "-",
+    "\u2014": "-",
+    "\u2026": "...",
+    "\u00df": "ss",
+    "\u2264": "<=",
+    "\u2265": ">=",
+    "\u2500": "-",
+    "\u2501": "-",
+}
 
 # The optional dependencies by the module that is missing without them.
 EXTRAS = {
@@ -58,6 +76,7 @@ def root(
 
 def run(arguments: Sequence[str] | None = None) -> int:
     """Run one command; the exit code. See `marl_sched.cli.main`."""
+    _print_anywhere()
     try:
         code = app(args=None if arguments is None else list(arguments), standalone_mode=False)
     except _UsageError as error:
@@ -76,6 +95,22 @@ def run(arguments: Sequence[str] | None = None) -> int:
     except (KeyboardInterrupt, typer.Abort):
         return 130
     return code if isinstance(code, int) else 0
+
+
+def _print_anywhere() -> None:
+    """Let output that an ASCII or Latin-1 terminal cannot show be written in its letters instead of raising."""
+    codecs.register_error("marl_sched.plain", _plainly)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="marl_sched.plain")
+
+
+def _plainly(error: UnicodeError) -> tuple[str, int]:
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    letters = unicodedata.normalize("NFKD", error.object[error.start : error.end])
+    plain = "".join(_PLAIN.get(letter, letter if letter.isascii() else "") for letter in letters)
+    return plain or "?", error.end
 
 
 def _refuse(message: str) -> int:

@@ -26,16 +26,18 @@ def add_to(app: typer.Typer) -> None:
     app.command(epilog=f"Example: marl-sched bench --env {options.DEFAULT_ENV} --json bench.json")(bench)
 
 
-def evaluate(selection: Selection, *, json: options.JsonFile = None) -> None:
+def evaluate(selection: Selection, *, json: options.JsonFile = None, format: options.Format = "table") -> None:
     """Play schedulers on the same instances with the same noise and print their scores."""
-    from marl_sched.cli.tables import print_scores
-    from marl_sched.files import write_json
+    from marl_sched.cli.tables import FORMATS, print_scores
+    from marl_sched.errors import require
+    from marl_sched.files import STDOUT, write_json
 
     options.check_output(json)
+    require("format", format, FORMATS)
     results = play(selection.resolve(), selection.baseline)
+    print_scores(results, format, stderr=json == STDOUT)  # first: what was computed is seen, whatever the disk says
     if json is not None:
         write_json(json, results)
-    print_scores(results)
 
 
 def compare(
@@ -43,27 +45,30 @@ def compare(
     *,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results and the plots.")],
     json: options.JsonFile = None,
+    format: options.Format = "table",
     log: Annotated[
         list[Path] | None, typer.Option("--log", metavar="CSV", help="A training log to plot; may be repeated.")
     ] = None,
 ) -> None:
     """As evaluate, and draw the scores, an episode of every scheduler and the learning curves of training logs."""
-    from marl_sched.cli.tables import print_scores
+    from marl_sched.cli.tables import FORMATS, print_scores
     from marl_sched.domain import get_domain
-    from marl_sched.files import write_json
+    from marl_sched.errors import require
+    from marl_sched.files import STDOUT, write_json
     from marl_sched.train.evaluation.compare import draw_learning_curves, draw_scores, draw_timelines, play_episode
 
     options.check_folder(out)
     options.check_output(json)
+    require("format", format, FORMATS)
     if log:  # first, as a log may be malformed
         better = get_domain(selection.env).better
         typer.echo(draw_learning_curves(out / "learning.png", log, better=better))
     resolved = selection.resolve()
     results = play(resolved, selection.baseline)
+    print_scores(results, format, stderr=json == STDOUT)
     for path in (out / "results.json", json):
         if path is not None:
             write_json(path, results)
-    print_scores(results)
     typer.echo(out / "results.json")
     typer.echo(draw_scores(out / "scores.png", results))
     problem = resolved.problem

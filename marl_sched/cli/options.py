@@ -12,6 +12,7 @@ import typer
 from marl_sched.cli.grouped import OwnOptions
 from marl_sched.envs import DOMAINS
 from marl_sched.errors import InvalidFileError, InvalidOptionError, UnknownNameError
+from marl_sched.files import STDOUT
 
 if TYPE_CHECKING:
     from marl_sched.agents.policies.cards import PolicyCard
@@ -34,7 +35,13 @@ View = Annotated[
 Instances = Annotated[
     str, typer.Option("--instances", metavar="N|DIR", help="How many to generate, or a folder of instance files.")
 ]
-JsonFile = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the results here.")]
+JsonFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--json", metavar="FILE", help="Write the results here; - is standard output, the table then goes to stderr."
+    ),
+]
+Format = Annotated[str, typer.Option("--format", help="Of the printed table: table, markdown, latex, csv or json.")]
 
 
 def state_problem(
@@ -144,6 +151,10 @@ def check_output(path: Path | None, option: str = "--json") -> None:
         return
     if path.is_dir():
         raise InvalidOptionError(f"{option}: {path} is a folder, expected a file")
+    if path == STDOUT or (path.exists() and not path.is_file()):  # a device or a pipe is written through
+        if path != STDOUT and not os.access(path, os.W_OK):
+            raise InvalidOptionError(f"{option}: no permission to write to {path}")
+        return
     check_folder(path.parent, option)
 
 

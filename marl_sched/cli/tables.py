@@ -2,39 +2,110 @@
 
 from __future__ import annotations
 
+import csv
+import json
+import sys
 import textwrap
 from typing import Any
 
 from rich import box
 from rich.console import Console
 from rich.table import Table
+from tabulate import tabulate
+
+from marl_sched.errors import require
 
 _WIDE = 110  # columns of a terminal
 _ALWAYS = ("feasible",)  # without which M1 says little
 _NAME_WIDTH = 24  # columns for a scheduler's name and what is said of it
+_SHORTEST_NAME = 12  # columns that a name keeps on a narrow terminal
+FORMATS = ("table", "markdown", "latex", "csv", "json")
 _LARGE = 10  # from here on a decimal is enough
 
 
-def print_scores(results: dict[str, Any]) -> None:
-    """The table of `marl-sched evaluate`: a row per scheduler, best mean first; a narrow terminal gets less of it."""
-    console = Console()
+def print_scores(results: dict[str, Any], style: str = "table", *, stderr: bool = False) -> None:
+    """The scores of `marl-sched evaluate`, best mean first, to standard output or standard error.
+
+    Styles: `table` for a terminal (a narrow one gets fewer measures, then shorter names, but never a number less),
+    `markdown` and `latex` with all measures, `csv` with a column for every number, and `json`, the results. Raises
+    UnknownNameError for another style.
+    """
+    require("format", style, FORMATS)
+    file = sys.stderr if stderr else sys.stdout
+    if style == "table":
+        _print_table(results, Console(stderr=stderr))
+        return
+    if style == "json":
+        file.write(json.dumps(results, indent=2, allow_nan=False) + "\n")
+        return
+    if style == "csv":
+        rows = [_flat_row(results, name, row) for name, row in _best_first(results)]
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+        return
+    measures = _other_measures(results)
+    lines = [
+        [" ".join(cell.splitlines()) for cell in (name, *_cells(results, row, measures))]
+        for name, row in _best_first(results)
+    ]
+    kind = {"markdown": "github", "latex": "latex_booktabs"}[style]
+    headings = ["scheduler", *_headings(results, measures)]
+    file.write(tabulate(lines, headers=headings, tablefmt=kind, disable_numparse=True) + "\n")
+
+
+def _best_first(results: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+    higher = results["better"] != "lower"
+    return sorted(results["schedulers"].items(), key=lambda item: item[1]["M1"]["mean"], reverse=higher)
+
+
+def _flat_row(results: dict[str, Any], name: str, row: dict[str, Any]) -> dict[str, Any]:
+    """A scheduler's numbers by the names of their columns; None where there is none."""
+    flat: dict[str, Any] = {"scheduler": name}
+    measures = ["M1", "difference", *(["M2"] if "reference" in results else []), *_other_measures(results)]
+    for measure in measures:
+        of = row[measure]
+        flat |= {f"{measure} {part}": of[part] for part in ("mean", "std", "iqm") if part in of}
+        for interval in ("ci95_such_instances", "ci95_these_instances"):
+            if interval in of:
+                low, high = of[interval] or (None, None)
+                flat |= {f"{measure} {interval} low": low, f"{measure} {interval} high": high}
+    return flat
+
+
+def _headings(results: dict[str, Any], measures: list[str]) -> list[str]:
+    return ["M1", "IQM", "difference", *(["M2 %"] if "reference" in results else []), *measures]
+
+
+def _cells(results: dict[str, Any], row: dict[str, Any], measures: list[str]) -> list[str]:
+    """A scheduler's cells under `_headings`: a figure, and below it its spread or its intervals."""
+    m1, difference = row["M1"], row["difference"]
+    cells = [
+        f"{_number(m1['mean'], 4)}\n{_spread(m1)}",
+        f"{_number(m1['iqm'], 4)}\n{_intervals(m1)}",
+        f"{_number(difference['mean'], 4, '+')}\n{_intervals(difference)}",
+    ]
+    if "reference" in results:
+        cells.append(f"{row['M2']['mean']:.1f}\n{_spread(row['M2'], 1)}")
+    return cells + [f"{_number(row[measure]['mean'], 4)}\n{_spread(row[measure])}" for measure in measures]
+
+
+def _print_table(results: dict[str, Any], console: Console) -> None:
     measures = [name for name in _other_measures(results) if console.width >= _WIDE or name in _ALWAYS]
     table = Table(title=_title(results), caption=_caption(results), show_lines=False, box=box.SIMPLE_HEAD)
-    table.add_column("scheduler", no_wrap=True)
-    gain = ["M2 %"] if "reference" in results else []
-    for heading in ("M1", "IQM", "difference", *gain, *measures):
-        table.add_column(heading, justify="right", min_width=7, overflow="fold")
-    lower = results["better"] == "lower"
-    for name, row in sorted(results["schedulers"].items(), key=lambda item: item[1]["M1"]["mean"], reverse=not lower):
-        m1, difference = row["M1"], row["difference"]
-        cells = [
-            f"{_number(m1['mean'], 4)}\n{_spread(m1)}",
-            f"{_number(m1['iqm'], 4)}\n{_intervals(m1)}",
-            f"{_number(difference['mean'], 4, '+')}\n{_intervals(difference)}",
-        ]
-        cells += [f"{row[name]['mean']:.1f}\n{_spread(row[name], 1)}" for name in ("M2",) if gain]
-        cells += [f"{_number(row[measure]['mean'], 4)}\n{_spread(row[measure])}" for measure in measures]
+    table.add_column("scheduler", overflow="ellipsis", min_width=_SHORTEST_NAME)
+    headings = _headings(results, measures)
+    for heading in headings:
+        table.add_column(heading, justify="right", no_wrap=True)
+    widths = [len(heading) for heading in headings]
+    for name, row in _best_first(results):
+        cells = _cells(results, row, measures)
+        widths = [max(w, *map(len, cell.splitlines())) for w, cell in zip(widths, cells, strict=True)]
         table.add_row("\n".join([name, *_notes(results, row)]), *cells)
+    # Two spaces beside every column and one at each side: below that, lines are longer than the terminal.
+    needed = _SHORTEST_NAME + sum(widths) + 2 * (len(widths) + 1) + 2
+    if console.width < needed:
+        console = Console(file=console.file, width=needed)
     console.print(table)
 
 

@@ -1,6 +1,10 @@
+import errno
 import json
 import os
+import re
 import stat
+import subprocess
+import sys
 
 import pytest
 
@@ -115,3 +119,74 @@ def test_a_key_that_an_object_has_twice_is_refused(tmp_path):
     path.write_text('{"planes": [{"hours": 1, "hours": 2}]}')
     with pytest.raises(InvalidFileError, match=r"twice\.json: hours: expected a key .* once, got \(1, 2\)"):
         read_json(path)
+
+
+def test_a_device_is_written_to_and_stays_a_device():
+    before = os.stat("/dev/null")
+    write_json("/dev/null", {"a": 1})
+    after = os.stat("/dev/null")
+    assert stat.S_ISCHR(after.st_mode)
+    assert (after.st_ino, after.st_rdev) == (before.st_ino, before.st_rdev)
+
+
+def test_a_device_elsewhere_is_written_through_too(tmp_path):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        write_json(pipe, [1])
+        assert os.read(reader, 100) == b"[\n  1\n]\n"
+        assert stat.S_ISFIFO(pipe.stat().st_mode)
+    finally:
+        os.close(reader)
+    assert [path.name for path in tmp_path.iterdir()] == ["pipe"]
+
+
+def test_a_link_stays_and_what_it_leads_to_is_replaced(tmp_path):
+    (tmp_path / "there").mkdir()
+    real, link, dangling = tmp_path / "there" / "real.json", tmp_path / "link.json", tmp_path / "new.json"
+    real.write_text("old")
+    link.symlink_to(real)
+    dangling.symlink_to(tmp_path / "there" / "made.json")
+    write_json(link, 1)
+    write_json(dangling, 2)
+    assert link.is_symlink()
+    assert dangling.is_symlink()
+    assert (read_json(real), read_json(tmp_path / "there" / "made.json")) == (1, 2)
+
+
+def test_standard_output_keeps_what_was_printed_before(tmp_path):
+    """`--json /dev/stdout > file`: the file is the same one, with the JSON behind the rest."""
+    program = (
+        "import sys; from marl_sched.files import write_json; print('before', flush=True); "
+        "write_json('/dev/stdout', [1]); write_json('-', [2])"
+    )
+    out = tmp_path / "out"
+    with out.open("w") as file:
+        subprocess.run([sys.executable, "-c", program], stdout=file, check=True)
+    assert out.read_text().split() == ["before", "[", "1", "]", "[", "2", "]"]
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["before", "[", "1", "]", "[", "2", "]"]
+
+
+def test_a_file_keeps_its_permissions(tmp_path):
+    path = tmp_path / "secret.json"
+    write_json(path, 1)
+    path.chmod(0o600)
+    write_json(path, 2)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+
+
+def test_a_full_disk_is_an_error_that_names_the_file(tmp_path):
+    with pytest.raises(OSError, match=re.escape(f"[Errno {errno.ENOSPC}]")) as caught:
+        write_json("/dev/full", [1])
+    assert caught.value.filename == "/dev/full"
+
+    def full(target):
+        with replacing(target):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(OSError, match="No space left") as caught:
+        full(tmp_path / "a.json")
+    assert caught.value.filename == str(tmp_path / "a.json")
+    assert list(tmp_path.iterdir()) == []
