@@ -102,8 +102,9 @@ def _print_table(results: dict[str, Any], console: Console) -> None:
         cells = _cells(results, row, measures)
         widths = [max(w, *map(len, cell.splitlines())) for w, cell in zip(widths, cells, strict=True)]
         table.add_row("\n".join([name, *_notes(results, row)]), *cells)
-    # Two spaces beside every column and one at each side: below that, lines are longer than the terminal.
-    needed = _SHORTEST_NAME + sum(widths) + 2 * (len(widths) + 1) + 2
+    # Two spaces beside every column, one between columns, one at each side: where that is too wide, lines are longer
+    # than the terminal.
+    needed = _SHORTEST_NAME + sum(widths) + 2 * (len(widths) + 1) + len(widths) + 2
     if console.width < needed:
         console = Console(file=console.file, width=needed)
     console.print(table)
