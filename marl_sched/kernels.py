@@ -29,6 +29,7 @@ from typing import Any
 import numba
 import platformdirs
 from numba.core.caching import FunctionCache
+from numba.core.dispatcher import Dispatcher
 
 log = logging.getLogger(__name__)
 
@@ -45,20 +46,20 @@ def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     """
     if function is None:
         return functools.partial(kernel, **options)
-    dispatcher = numba.njit(**options)(function)
-    if isinstance(dispatcher, numba.core.dispatcher.Dispatcher):  # with NUMBA_DISABLE_JIT it is the plain function
+    dispatcher: Any = numba.njit(**options)(function)
+    if isinstance(dispatcher, Dispatcher):  # with NUMBA_DISABLE_JIT it is the plain function
         dispatcher._cache = _cache_of(function)
     return dispatcher
 
 
 def _cache_of(function: Callable[..., Any]) -> FunctionCache:
     """A cache in the package's folder; Numba reads the folder from its configuration when the cache is made."""
-    before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = str(cache_folder())
+    config: Any = numba.config
+    before, config.CACHE_DIR = config.CACHE_DIR, str(cache_folder())
     try:
         return _KernelCache(function)
     finally:
-        numba.config.CACHE_DIR = before
+        config.CACHE_DIR = before
 
 
 class _KernelCache(FunctionCache):

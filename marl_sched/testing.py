@@ -72,7 +72,7 @@ def check_turns(simulator: TurnSimulator) -> Trace:
         observation = simulator.observe(simulator.acting)
         _check_observation(simulator, observation)
         action = _choice(observation[ACTION_MASK][0], len(trace))
-        turn = {"agent": int(simulator.acting[0]), "time": int(simulator.time[0]), "action": action}
+        turn: dict[str, Any] = {"agent": int(simulator.acting[0]), "time": int(simulator.time[0]), "action": action}
         turn["seen"] = {name: array[0].tobytes() for name, array in observation.items()}
         actions = np.where(simulator.acting >= 0, [_choice(mask, len(trace)) for mask in observation[ACTION_MASK]], 0)
         simulator.step(actions)

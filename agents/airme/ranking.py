@@ -160,9 +160,9 @@ def rank_observation(observation: Mapping[str, np.ndarray], failure: np.ndarray,
     `failure` float64 (n_types, n_parts, longest + 1) covers every plane's counters.
     """
     # arrays from a message are read-only, which is another type to Numba
-    plane = np.require(observation["plane"], np.float32, "CW")
-    time = np.require(observation["time"], np.float32, "CW")
-    legal = np.require(observation["action_mask"], np.int8, "CW")
+    plane = np.require(observation["plane"], np.float32, ["C", "W"])
+    time = np.require(observation["time"], np.float32, ["C", "W"])
+    legal = np.require(observation["action_mask"], np.int8, ["C", "W"])
     out = np.empty(legal.shape)
     _ranks()(plane, time, legal, failure, of, out)
     return out
