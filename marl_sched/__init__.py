@@ -11,6 +11,7 @@ when it is first used.
 
 from __future__ import annotations
 
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -39,6 +40,10 @@ def __getattr__(name: str) -> Any:
         from importlib.metadata import version
 
         return version("marl-sched")
+    stem, _, number = name.rpartition("_v")
+    versions = [module for module in _MODULES if module.rpartition("_v")[0] == stem and number.isdigit()]
+    if versions:
+        raise AttributeError(f"marl_sched has no {name}; the versions of this environment are {', '.join(versions)}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
@@ -47,3 +52,7 @@ def __dir__() -> list[str]:
 
 
 _register()
+if "pettingzoo" in sys.modules:
+    from marl_sched.pettingzoo_ids import register as _register_with_pettingzoo
+
+    _register_with_pettingzoo()

@@ -120,6 +120,7 @@ from marl_sched.envs.airme.views import View
 from marl_sched.envs.api.aec import SchedulingAEC
 from marl_sched.envs.api.options import ENVIRONMENT_DEFAULTS, EnvironmentOptions, with_defaults
 from marl_sched.envs.api.parallel import SchedulingParallel
+from marl_sched.pettingzoo_ids import register
 
 __all__ = ["AirmeOptions", "env", "parallel_env", "raw_env"]
 
@@ -181,3 +182,6 @@ def env(**options: Unpack[AirmeOptions]) -> OrderEnforcingWrapper:
 def parallel_env(**options: Unpack[AirmeOptions]) -> SchedulingParallel:
     """The Parallel environment; options as `raw_env`."""
     return SchedulingParallel("airme", **with_defaults(DEFAULTS, options))
+
+
+register()

@@ -133,6 +133,7 @@ from marl_sched.envs.api.options import ENVIRONMENT_DEFAULTS, EnvironmentOptions
 from marl_sched.envs.api.parallel import SchedulingParallel
 from marl_sched.envs.murse.instance import MurseInstance
 from marl_sched.envs.murse.views import FullView, LocalView
+from marl_sched.pettingzoo_ids import register
 
 __all__ = ["MurseOptions", "env", "parallel_env", "raw_env"]
 
@@ -195,3 +196,6 @@ def env(**options: Unpack[MurseOptions]) -> OrderEnforcingWrapper:
 def parallel_env(**options: Unpack[MurseOptions]) -> SchedulingParallel:
     """The Parallel environment; options as `raw_env`."""
     return SchedulingParallel("murse", **with_defaults(DEFAULTS, options))
+
+
+register()
