@@ -14,7 +14,7 @@ PAGES = {"marl_sched/AirME-v0": "marl_sched.airme_v0", "marl_sched/MuRSE-v0": "m
 
 
 def register() -> None:
-    """Make `pettingzoo.make("aec", name)` and `pettingzoo.make("parallel", name)` work; nothing where PettingZoo has no registry."""
+    """Make `pettingzoo.make("aec", name)` and `"parallel"` work, where PettingZoo has a registry."""
     if find_spec("pettingzoo.env_registry") is None:
         return
     from pettingzoo.env_registry.registration import aec_registry, parallel_registry
