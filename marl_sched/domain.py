@@ -142,7 +142,7 @@ class Domain:
         simulator: (instances, **options) -> TurnSimulator. Every domain understands the options `view`,
             `objective`, `horizon`, `seed` and `pad` (a scale's name whose largest instance sets the padding,
             or None: the largest of the given instances); unknown options raise TypeError.
-        central: the centralised environment API.
+        central: the centralised Gymnasium environment.
         render: mode -> function of a simulator row, `ansi` gives str, `rgb_array` gives uint8 (H, W, 3).
         render_options: render mode -> options that a simulator must be made with to be drawn so.
         default_horizon: simulated time of an episode.

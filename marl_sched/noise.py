@@ -49,7 +49,7 @@ class Stream(IntEnum):
     """Streams that every domain shares."""
 
     POLICY = 0  # a policy's own sampling, entity = agent
-    CONFLICT = 1  # who of several agents has an action in the Parallel environment API, entity = action, draw = agent
+    CONFLICT = 1  # which of several agents has its action in the Parallel API, entity = action, draw = agent
 
 
 def as_seed(seed: Any) -> int:

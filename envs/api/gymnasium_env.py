@@ -43,7 +43,7 @@ class SchedulingEnv(SavesState, gymnasium.Env):
         self, domain: str | Domain, *, render_mode: str | None = None, flat: bool = False, **options: Any
     ) -> None:
         if "view" in options:
-            raise InvalidOptionError("view: the centralised environment API sees everything; views are for agents")
+            raise InvalidOptionError("view: the centralised environment sees everything; views are for agents")
         self._single = SingleEpisode(domain, render_mode=render_mode, **options)
         self.render_mode = render_mode
         self.simulator = self._single.simulator

@@ -127,7 +127,7 @@ class SchedulingParallel(SchedulingEnvironment, ParallelEnv[str, Any, int]):
     def _play(self, choices: Mapping[int, int], losers: set[int]) -> tuple[float, set[int]]:
         """Take the epoch's turns in the simulator's order, losers last; the team reward and who met with a conflict.
 
-        Losers come to their actions when those are taken, which is the conflict of any other environment API. A turn
+        Losers come to their actions when those are taken, which is the conflict of the other environment APIs. A turn
         may end the decision epoch for agents that have not had theirs, as the last task of a MuRSE round does; their
         choices lapse.
         """
