@@ -27,7 +27,7 @@ DOMAINS, SCHEDULERS, OBJECTIVES = "marl_sched.domains", "marl_sched.schedulers",
 class Lazy:
     """Stands for the object `package.module:attribute`, which is imported when it is first called or looked into.
 
-    A domain declares parts that most commands do not need in this way: rendering, telemetry, the centralised environment.
+    A domain declares parts that most commands do not need in this way: rendering, telemetry, the joint action.
     """
 
     def __init__(self, where: str) -> None:

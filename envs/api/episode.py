@@ -137,7 +137,7 @@ class SingleEpisode:
         return float(self.simulator.reward[0])
 
     def as_action(self, agent: int, action: Any) -> int:
-        """What a user gave as an action, an integer in [0, max_actions), legal or not; IllegalActionError outside the space."""
+        """A given action as an integer in [0, max_actions), legal or not; IllegalActionError outside the space."""
         try:
             action = operator.index(action)
         except TypeError as error:
