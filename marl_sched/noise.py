@@ -14,7 +14,9 @@ The name is absorbed in two steps, because a simulator reuses the first for thou
 Seeds number problems within a split, and splits never meet: instance i of seed s is another one in "train", in
 "validation" and in "test", and so is the noise of its episodes. `marl-sched evaluate`, `compare` and deployments play
 "test", whose instance i of seed s is drawn by `numpy.random.default_rng([s, i])`; environments are made for learning
-and play "train" unless told otherwise.
+and play "train" unless told otherwise. The scale is not in that name: under one seed, instance i of every scale has its
+sizes from the same uniforms, so that a seed with few planes per crew has them on all scales alike. Take another seed
+for every scale where results on several scales are to count as independent.
 
 The compiled functions may be called from Python or from other kernels. Called from Python, a key
 comes back as a plain int: pass it on as `np.uint64(key)`, since Numba takes plain ints for signed. Streams below

@@ -63,6 +63,8 @@ def _head(results: Mapping[str, Any]) -> Iterator[str]:
         "no scheduler expects more, even if it knows the failure model and the clock; a mean over few episodes can "
         "pass it by chance."
     )
+    if results["note"]:
+        yield results["note"]
 
 
 def _published_layout(table: Mapping[str, Any]) -> str:

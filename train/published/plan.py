@@ -124,6 +124,7 @@ class Plan(_Part, frozen=True, kw_only=True):
         measure: what M1 is, in words.
         source: where the published entries stand.
         seed: of instances and noise.
+        note: what a reader has to know of this seed's instances.
         horizon: simulated time of an episode; None is the domain's default.
         rows: schedulers in the order of the tables. The domain's reference scheduler has to be one of them.
         decentralisation: the section about views.
@@ -137,6 +138,7 @@ class Plan(_Part, frozen=True, kw_only=True):
     full: Size
     quick: Size
     seed: Seed
+    note: str = ""
     horizon: Count | None = None
     rows: Annotated[list[Row], Meta(min_length=1)]
     decentralisation: Decentralisation

@@ -51,6 +51,7 @@ class Results:
             "bound": msgspec.to_builtins(size.bound),
             "measure": plan.measure,
             "source": plan.source,
+            "note": plan.note.strip(),
             "reference": self._reference_row().label,
             "objectives": tables,
             "decentralisation": self._decentralisation(),
