@@ -59,10 +59,10 @@ class Parts:
             save_best(self.learner.policy, self.record, counters.update, score, directory)
         return {"validation": score, "best": counters.best}
 
-    def save(self, counters: Counters, directory: Path) -> None:
-        """Write a checkpoint if it is time to."""
+    def save(self, counters: Counters, directory: Path, *, now: bool = False) -> None:
+        """Write a checkpoint if it is time to, or `now`."""
         config = self.record.config
-        if counters.update % config.save_every and counters.update != config.updates:
+        if not now and counters.update % config.save_every and counters.update != config.updates:
             return
         save_checkpoint(directory, counters, self.learner, self.collector.state())
 

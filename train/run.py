@@ -21,6 +21,7 @@ from marl_sched.train.collect import Rollout
 from marl_sched.train.config import RunRecord, load_config, load_record
 from marl_sched.train.device import described, device_of
 from marl_sched.train.export import CONFIG
+from marl_sched.train.guard import exclusive, stopping
 from marl_sched.train.logging import RunLog
 from marl_sched.train.malloc import keep_freed_memory
 from marl_sched.train.parts import Parts, build
@@ -36,18 +37,19 @@ def train_from_overrides(overrides: Sequence[str], *, quiet: bool = False) -> Pa
     """
     config = load_config(overrides)
     directory = Path(config.directory())
-    if (directory / CONFIG).exists():
-        raise InvalidOptionError(
-            f"run_dir: {directory} holds a run already: go on with it by `marl-sched resume {directory}`, or choose "
-            "another folder with run_dir=DIR"
-        )
-    record = RunRecord(config=config, overrides=list(overrides), revision=source_revision())
-    parts, counters = build(record), Counters()
-    if config.start_from is not None:
-        parts = replace(parts, record=structs.replace(record, start=parts.start_from(config.start_from)))
-    parts.save(counters, directory)  # first, so that whatever holds a run can be resumed
-    write_json(directory / CONFIG, msgspec.to_builtins(parts.record))
-    return train(parts, counters, directory, quiet=quiet)
+    with exclusive(directory):
+        if (directory / CONFIG).exists():
+            raise InvalidOptionError(
+                f"run_dir: {directory} holds a run already: go on with it by `marl-sched resume {directory}`, or "
+                "choose another folder with run_dir=DIR"
+            )
+        record = RunRecord(config=config, overrides=list(overrides), revision=source_revision())
+        parts, counters = build(record), Counters()
+        if config.start_from is not None:
+            parts = replace(parts, record=structs.replace(record, start=parts.start_from(config.start_from)))
+        parts.save(counters, directory)  # first, so that whatever holds a run can be resumed
+        write_json(directory / CONFIG, msgspec.to_builtins(parts.record))
+        return train(parts, counters, directory, quiet=quiet)
 
 
 def resume(run_dir: str | Path, *, quiet: bool = False) -> Path:
@@ -58,22 +60,27 @@ def resume(run_dir: str | Path, *, quiet: bool = False) -> Path:
     """
     directory = Path(run_dir)
     record, revision = load_record(directory / CONFIG), source_revision()
-    if revision != [record.revision, *record.resumed_on][-1]:
-        record = structs.replace(record, resumed_on=[*record.resumed_on, revision])
-        write_json(directory / CONFIG, msgspec.to_builtins(record))
-        warnings.warn(f"{directory}: goes on with another source than before: {record.source}", stacklevel=2)
-    parts = build(record)
-    return train(parts, parts.restore(directory), directory, quiet=quiet)
+    with exclusive(directory):
+        if revision != [record.revision, *record.resumed_on][-1]:
+            record = structs.replace(record, resumed_on=[*record.resumed_on, revision])
+            write_json(directory / CONFIG, msgspec.to_builtins(record))
+            warnings.warn(f"{directory}: goes on with another source than before: {record.source}", stacklevel=2)
+        parts = build(record)
+        return train(parts, parts.restore(directory), directory, quiet=quiet)
 
 
 def train(parts: Parts, counters: Counters, directory: Path, *, quiet: bool = False) -> Path:
-    """The loop. Everything random in an update is a function of (seed, update, instance number)."""
+    """The loop. Everything random in an update is a function of (seed, update, instance number).
+
+    The first SIGINT or SIGTERM ends it after the running update, with a checkpoint.
+    """
     config = parts.record.config
     torch.set_num_threads(config.threads)
     keep_freed_memory()
     device = described(device_of(parts.learner.policy))
-    with RunLog(directory, updates=config.updates, start=counters.update, device=device, quiet=quiet) as log:
-        while counters.update < config.updates:
+    log = RunLog(directory, updates=config.updates, start=counters.update, device=device, quiet=quiet)
+    with stopping() as stop, log:
+        while counters.update < config.updates and not stop.requested:
             started = time.perf_counter()
             update = counters.update
             rollout = parts.collector.collect(Sampler(parts.learner.policy), parts.length(update))
@@ -86,6 +93,9 @@ def train(parts: Parts, counters: Counters, directory: Path, *, quiet: bool = Fa
             counters.seconds += time.perf_counter() - started
             log.update(_row(counters, rollout) | report | scores)
             parts.save(counters, directory)
+        if stop.requested:
+            parts.save(counters, directory, now=True)
+    stop.leave(f"stopped after update {counters.update}: go on with it by `marl-sched resume {directory}`")
     return directory
 
 
