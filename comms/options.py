@@ -123,8 +123,11 @@ class WorldOptions:
         domain.require_scale(self.scale)
         return domain.load(Path(self.instance)) if self.instance else domain.instances(self.scale, 1, self.seed)[0]
 
-    def simulator(self) -> TurnSimulator:
-        """The plant's simulator, one instance at the start of its episode; typed errors for options that do not fit."""
+    def simulator(self, **extra: Any) -> TurnSimulator:
+        """The plant's simulator, one instance at the start of its episode; typed errors for options that do not fit.
+
+        `extra` are further options of the domain's simulator, such as those of its pictures.
+        """
         domain = self.domain()
         view = domain.view(self.view, **self.view_options)
         return domain.simulator(
@@ -134,6 +137,7 @@ class WorldOptions:
             horizon=self.horizon or domain.default_horizon,
             seed=self.seed,
             pad=None if self.instance else self.scale,
+            **extra,
         )
 
     def chosen_objective(self) -> str:

@@ -35,6 +35,7 @@ def add_to(app: typer.Typer) -> None:
     app.command(epilog="Example: marl-sched agent --agent 3 --policy condition --connect tcp/127.0.0.1:7447")(agent)
     example = f"Example: marl-sched deploy {_PROBLEM} --policy random --agent-policy crew_3=condition --json run.json"
     app.command(epilog=example, context_settings=DOMAIN_OPTIONS)(takes(Plant)(deploy))
+    app.command(epilog="Example: marl-sched replay out/run/run.jsonl --picture run.png")(replay)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -208,6 +209,27 @@ def deploy(
     finish(report)
 
 
+def replay(
+    log: Annotated[
+        Path, typer.Argument(metavar="LOG", help="A run's log, as `world --log` and `deploy --folder` keep it.")
+    ],
+    picture: Annotated[Path | None, typer.Option("--picture", metavar="FILE", help="Draw the run as PNG.")] = None,
+    json: Json = None,
+) -> None:
+    """Play a deployed run again from its log, to the last bit, and report it."""
+    from marl_sched.comms.replay import replay as play_log
+    from marl_sched.files import write_json
+
+    options.check_output(json)
+    options.check_output(picture)
+    if not log.is_file():
+        raise InvalidOptionError(f"{log}: expected a run's log, there is no such file")
+    report = play_log(log, picture)
+    if json is not None:
+        write_json(json, report)
+    print_report(report)
+
+
 @contextmanager
 def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
     """A bar on stderr, where there is a terminal, that follows (phase, simulated time, horizon)."""
@@ -240,6 +262,8 @@ def print_report(report: dict[str, Any]) -> None:
         f"{report['time']} {report['unit']}, {len(report['agents'])} agents, {len(report['decisions'])} decisions"
     )
     typer.echo(f"M1 ({report['objective']}): {report['M1']:.4f}")
+    if "from_log" in report:
+        return
     typer.echo(f"{messages['count']} messages, {messages['bytes']} bytes")
     if latency["p50"] is not None:
         typer.echo(f"decision latency: p50 {latency['p50']:.2f} ms, p99 {latency['p99']:.2f} ms")

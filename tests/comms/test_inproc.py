@@ -9,15 +9,23 @@ import numpy as np
 import pytest
 
 from marl_sched.comms.decision_log import SCHEMA, FileLog, Header, MemoryLog, Step, play_again, read_log
+from marl_sched.comms.fork_server import warm_up
 from marl_sched.comms.inproc import Threads, play
 from marl_sched.comms.options import WorldOptions
 from marl_sched.comms.plant import SimulatedPlant
 from marl_sched.comms.protocol import events as ev
 from marl_sched.comms.protocol import keys
 from marl_sched.comms.protocol import messages as wire
+from marl_sched.comms.replay import replay
 from marl_sched.errors import InvalidFileError, InvalidOptionError
 
 LOCAL = {"view": "local", "view_options": {"reach": 1, "comm": 1, "staleness": 12}}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled() -> None:
+    """What is played here is compiled before: threads that compile would take each other's time."""
+    warm_up(options(), ["random", "condition"])
 
 
 def options(**changes) -> WorldOptions:
@@ -199,3 +207,24 @@ def test_file_that_is_no_log_is_refused(tmp_path, content):
     path.write_bytes(content)
     with pytest.raises(InvalidFileError, match="line 1"):
         read_log(path)
+
+
+def test_replay_gives_the_report_of_the_run_and_its_picture(tmp_path):
+    pytest.importorskip("matplotlib")
+    given, path, picture = options(horizon=30), tmp_path / "run.jsonl", tmp_path / "run.png"
+    report = Threads(given, ["random"] * 7, commits=logged(path, given)).play()
+    again = replay(path, picture)
+    for name in ("ending", "decisions", "rewards", "objectives", "M1", "profit", "view", "time"):
+        assert again[name] == report[name], name
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_replay_of_a_log_that_ends_early_says_where(tmp_path):
+    given, path = options(horizon=30), tmp_path / "run.jsonl"
+    Threads(given, ["random"] * 7, commits=logged(path, given)).play()
+    lines = path.read_bytes().splitlines(keepends=True)
+    path.write_bytes(b"".join(lines[:10]))
+    again = replay(path)
+    assert again["ending"]["kind"] == "failed"
+    assert again["ending"]["reason"] == f"the log ends at hour {again['time']}"
+    assert len(again["decisions"]) == 9
