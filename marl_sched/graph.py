@@ -81,6 +81,14 @@ class Features:
         """The place of a feature in the last axis; UnknownNameError for a name that none has."""
         return self._index[require("feature", name, self._index)]
 
+    def scale(self, name: str) -> float:
+        """What an observation divides the feature by."""
+        return self._features[self.index(name)].scale
+
+    def factor(self, name: str) -> np.float32:
+        """What a kernel multiplies the quantity by to write the feature: 1 / scale in float32."""
+        return np.float32(1.0 / self.scale(name))
+
     def read(self, array: np.ndarray, name: str) -> np.ndarray:
         """A quantity in its own unit, float64 (...), from an observation's float32 (..., f)."""
         index = self.index(name)

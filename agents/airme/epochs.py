@@ -28,7 +28,7 @@ from marl_sched.envs.airme.dynamics import (
     require_consistent,
     take_turn,
 )
-from marl_sched.envs.airme.graph import TENTH
+from marl_sched.envs.airme.graph import INCOME_SCALE, PER_INCOME
 from marl_sched.envs.airme.simulator import AirmeSimulator, example
 from marl_sched.envs.airme.views import ring_distance
 from marl_sched.kernels import kernel
@@ -163,7 +163,7 @@ def known(plane: Record) -> Known:
         plane.broken,
         plane.hours,
         plane.landings,
-        np.float64(np.float32(plane.income * TENTH)) * 10,
+        np.float64(np.float32(plane.income * PER_INCOME)) * INCOME_SCALE,
         plane.mission_hours - plane.mission_done,
     )
 

@@ -16,16 +16,15 @@ import numpy as np
 
 from marl_sched.agents.airme.bound.plane import BROKEN, HOURS_CAP, LANDINGS_CAP
 from marl_sched.compiled import entry
-from marl_sched.envs.airme.graph import graph_spec
+from marl_sched.envs.airme.graph import PLANE
 from marl_sched.kernels import kernel
 
 CORRECTIVE, CORRECTIVE_AS_PUBLISHED, CONDITION, PERIODIC, MODEL_BASED, PREVENTIVE_FIRST, INDEX = range(7)
 FIRST = 1e9  # added to the rank of planes that go before all others
-_FEATURES = graph_spec(0).node("plane").features
-HOURS, LANDINGS, _INCOME, _BROKEN, _MISSION, _DONE = map(
-    _FEATURES.index, ("hours/10", "landings/5", "income/10", "broken", "mission_hours/10", "mission_done/10")
-)
-N_FEATURES = len(_FEATURES)  # of a plane, without the one-hot of its type
+_NAMES = ("hours", "landings", "income", "broken", "mission_hours", "mission_done")
+HOURS, LANDINGS, _INCOME, _BROKEN, _MISSION, _DONE = map(PLANE.index, _NAMES)
+_PER_HOUR, _PER_LANDING, _PER_INCOME, _, _PER_MISSION, _PER_DONE = map(PLANE.scale, _NAMES)
+N_FEATURES = len(PLANE)  # of a plane, without the one-hot of its type
 
 
 class IndexTables(NamedTuple):
@@ -202,8 +201,8 @@ def known_from(features: np.ndarray) -> Known:
     return Known(
         kind,
         features[_BROKEN] > 0,
-        round(np.float64(features[HOURS]) * 10),
-        round(np.float64(features[LANDINGS]) * 5),
-        np.float64(features[_INCOME]) * 10,
-        round((np.float64(features[_MISSION]) - np.float64(features[_DONE])) * 10),
+        round(np.float64(features[HOURS]) * _PER_HOUR),
+        round(np.float64(features[LANDINGS]) * _PER_LANDING),
+        np.float64(features[_INCOME]) * _PER_INCOME,
+        round(np.float64(features[_MISSION]) * _PER_MISSION - np.float64(features[_DONE]) * _PER_DONE),
     )

@@ -20,6 +20,7 @@ from marl_sched.agents.airme.epochs import EpochPlayer
 from marl_sched.agents.airme.ranking import N_FEATURES, Ranking
 from marl_sched.agents.base import ObservationScheduler, PrivilegedInfo, best_action
 from marl_sched.envs.airme.aircraft import PUBLISHED_TYPES, AircraftType, FailureModel, failure_table
+from marl_sched.envs.airme.graph import PLANE
 from marl_sched.envs.airme.simulator import AirmeSimulator
 from marl_sched.errors import InvalidOptionError
 from marl_sched.simulation import TurnSimulator
@@ -123,7 +124,7 @@ class ModelBasedRule(PriorityRule):
 
     def _failures(self, plane: np.ndarray) -> np.ndarray:
         require_types(self.name, plane.shape[-1] - N_FEATURES, self._types)
-        longest = int(max((plane[..., ranking.HOURS] * 10).max(), (plane[..., ranking.LANDINGS] * 5).max())) + 1
+        longest = int(max(PLANE.read(plane, "hours").max(), PLANE.read(plane, "landings").max())) + 1
         return _failure_table(self._types, self._failure, longest.bit_length())
 
 

@@ -14,20 +14,42 @@ import numpy as np
 from marl_sched.envs.airme.dynamics import UNDECIDED, Record, State
 from marl_sched.envs.airme.views import EVERYWHERE, home_sector, ring_distance
 from marl_sched.errors import InvalidOptionError
-from marl_sched.graph import GraphSpec, NodeType, Relation
+from marl_sched.graph import Feature, Features, GraphSpec, NodeType, Relation
 from marl_sched.kernels import kernel
 
-_PLANE = (
-    "hours/10", "usage_probability", "landings/5", "broken", "income/10", "free", "in_repair", "chosen_this_hour",
-    "job_hours/10", "job_cost_per_hour/10", "job_done/10", "flying", "mission_hours/10", "mission_done/10",
-    "age_hours/10", "null_plane",
+PLANE = Features(
+    Feature("hours", 10, whole=True), Feature("usage_probability"), Feature("landings", 5, whole=True),
+    Feature("broken"), Feature("income", 10), Feature("free"), Feature("in_repair"), Feature("chosen_this_hour"),
+    Feature("job_hours", 10, whole=True), Feature("job_cost_per_hour", 10), Feature("job_done", 10, whole=True),
+    Feature("flying"), Feature("mission_hours", 10, whole=True), Feature("mission_done", 10, whole=True),
+    Feature("age_hours", 10, whole=True), Feature("null_plane"),
 )  # fmt: skip
-_CREW = ("free", "busy", "chose_this_hour", "acting", "job_hours/10", "job_done/10")
-_STATE = (
-    "free_share", "broken_share", "in_repair_share", "flying_share", "planes_per_crew/10", "free_crews_share",
-    "mean_hours/100", "mean_landings/10", "mean_income/10",
+CREW_FEATURES = Features(
+    Feature("free"), Feature("busy"), Feature("chose_this_hour"), Feature("acting"),
+    Feature("job_hours", 10, whole=True), Feature("job_done", 10, whole=True),
 )  # fmt: skip
-TENTH, FIFTH, HALF = np.float32(0.1), np.float32(0.2), np.float32(0.5)
+STATE_FEATURES = Features(
+    Feature("free_share"), Feature("broken_share"), Feature("in_repair_share"), Feature("flying_share"),
+    Feature("planes_per_crew", 10), Feature("free_crews_share"), Feature("mean_hours", 100),
+    Feature("mean_landings", 10), Feature("mean_income", 10),
+)  # fmt: skip
+_PLANE, _CREW, _STATE = PLANE.labels, CREW_FEATURES.labels, STATE_FEATURES.labels
+(
+    HOURS, USAGE, LANDINGS, BROKEN, INCOME, FREE, IN_REPAIR, CHOSEN, JOB_HOURS, JOB_COST, JOB_DONE, FLYING,
+    MISSION_HOURS, MISSION_DONE, AGE, NULL_PLANE,
+) = range(len(PLANE))  # fmt: skip
+(
+    PER_HOURS, PER_LANDINGS, PER_INCOME, PER_JOB_HOURS, PER_JOB_COST, PER_JOB_DONE, PER_MISSION_HOURS, PER_MISSION_DONE,
+    PER_AGE,
+) = map(
+    PLANE.factor,
+    (
+        "hours", "landings", "income", "job_hours", "job_cost_per_hour", "job_done", "mission_hours", "mission_done",
+        "age_hours",
+    ),
+)  # fmt: skip
+INCOME_SCALE = PLANE.scale("income")
+TENTH, HALF = np.float32(0.1), np.float32(0.5)
 N_PLANE, N_CREW, N_STATE = len(_PLANE), len(_CREW), len(_STATE)
 
 
@@ -149,7 +171,7 @@ def see_planes(state: State, usage: np.ndarray, b: int, agent: int, reach: int, 
     n_crews, now = row.n_crews, row.time
     snapshot_hour = max(0, now - staleness)
     out.plane[b, 0] = 0
-    out.plane[b, 0, 15] = 1
+    out.plane[b, 0, NULL_PLANE] = 1
     out.plane_mask[b, 0] = 1
     visible = 0
     for slot in range(1, out.plane.shape[1]):
@@ -187,22 +209,22 @@ def describe(plane: Record, usage: np.ndarray, age: int, out: np.ndarray, b: int
     the private memory says so nevertheless, as somebody has the plane in hand.
     """
     in_hand = plane.crew >= 0 or (age > 0 and plane.chosen >= 0)
-    out[b, slot, 0] = plane.hours * TENTH
-    out[b, slot, 1] = usage[plane.kind]
-    out[b, slot, 2] = plane.landings * FIFTH
-    out[b, slot, 3] = plane.broken
-    out[b, slot, 4] = plane.income * TENTH
-    out[b, slot, 5] = not in_hand
-    out[b, slot, 6] = in_hand
-    out[b, slot, 7] = 0
-    out[b, slot, 8] = plane.job_hours * TENTH
-    out[b, slot, 9] = plane.job_cost * TENTH
-    out[b, slot, 10] = plane.job_done * TENTH
-    out[b, slot, 11] = plane.mission_hours > 0
-    out[b, slot, 12] = plane.mission_hours * TENTH
-    out[b, slot, 13] = plane.mission_done * TENTH
-    out[b, slot, 14] = age * TENTH
-    out[b, slot, 15] = 0
+    out[b, slot, HOURS] = plane.hours * PER_HOURS
+    out[b, slot, USAGE] = usage[plane.kind]
+    out[b, slot, LANDINGS] = plane.landings * PER_LANDINGS
+    out[b, slot, BROKEN] = plane.broken
+    out[b, slot, INCOME] = plane.income * PER_INCOME
+    out[b, slot, FREE] = not in_hand
+    out[b, slot, IN_REPAIR] = in_hand
+    out[b, slot, CHOSEN] = 0
+    out[b, slot, JOB_HOURS] = plane.job_hours * PER_JOB_HOURS
+    out[b, slot, JOB_COST] = plane.job_cost * PER_JOB_COST
+    out[b, slot, JOB_DONE] = plane.job_done * PER_JOB_DONE
+    out[b, slot, FLYING] = plane.mission_hours > 0
+    out[b, slot, MISSION_HOURS] = plane.mission_hours * PER_MISSION_HOURS
+    out[b, slot, MISSION_DONE] = plane.mission_done * PER_MISSION_DONE
+    out[b, slot, AGE] = age * PER_AGE
+    out[b, slot, NULL_PLANE] = 0
     for k in range(usage.shape[0]):
         out[b, slot, N_PLANE + k] = plane.kind == k
 
@@ -218,13 +240,13 @@ def hear_of_jobs(state: State, b: int, out: Arrays) -> None:
         if slot <= 0 or out.plane_mask[b, slot] == 0:
             continue
         out.repairing[b, crew] = slot
-        out.plane[b, slot, 5] = 0
+        out.plane[b, slot, FREE] = 0
         if record.plane > 0:
-            out.plane[b, slot, 6] = 1
-            out.plane[b, slot, 8] = record.job_hours * TENTH
-            out.plane[b, slot, 10] = record.job_done * TENTH
+            out.plane[b, slot, IN_REPAIR] = 1
+            out.plane[b, slot, JOB_HOURS] = record.job_hours * PER_JOB_HOURS
+            out.plane[b, slot, JOB_DONE] = record.job_done * PER_JOB_DONE
         else:
-            out.plane[b, slot, 7] = 1
+            out.plane[b, slot, CHOSEN] = 1
 
 
 @kernel
@@ -233,7 +255,7 @@ def write_action_mask(state: State, b: int, agent: int, out: Arrays) -> None:
     if state.crews[b, agent].plane > 0 or state.crews[b, agent].choice != UNDECIDED:
         return
     for slot in range(1, state.rows[b].n_planes + 1):
-        if out.plane[b, slot, 5] == 1:
+        if out.plane[b, slot, FREE] == 1:
             out.action_mask[b, slot] = 1
 
 
@@ -250,13 +272,13 @@ def summarise(out: Arrays, b: int, n_planes: int) -> None:
         if out.plane_mask[b, slot] == 0:
             continue
         visible += 1
-        out.state[b, 0] += out.plane[b, slot, 5]
-        out.state[b, 1] += out.plane[b, slot, 3]
-        out.state[b, 2] += out.plane[b, slot, 6]
-        out.state[b, 3] += out.plane[b, slot, 11]
-        out.state[b, 6] += out.plane[b, slot, 0]
-        out.state[b, 7] += out.plane[b, slot, 2]
-        out.state[b, 8] += out.plane[b, slot, 4]
+        out.state[b, 0] += out.plane[b, slot, FREE]
+        out.state[b, 1] += out.plane[b, slot, BROKEN]
+        out.state[b, 2] += out.plane[b, slot, IN_REPAIR]
+        out.state[b, 3] += out.plane[b, slot, FLYING]
+        out.state[b, 6] += out.plane[b, slot, HOURS]
+        out.state[b, 7] += out.plane[b, slot, LANDINGS]
+        out.state[b, 8] += out.plane[b, slot, INCOME]
         for k in range(N_STATE, out.state.shape[1]):
             out.state[b, k] += out.plane[b, slot, N_PLANE + k - N_STATE]
     share = np.float32(1.0) / np.float32(max(visible, 1))

@@ -60,13 +60,13 @@ def observe(state: State, rules: Rules, agents: np.ndarray, sensing: float, comm
             continue
         survey(state, rules, b, viewer, sensing, comm, sight)
         see_agents(state, b, viewer, sight, out)
-        see_tasks(state, b, viewer, sight, out)
+        startable = see_tasks(state, b, viewer, sight, out)
         see_durations(state, b, sight, out)
         see_locations(state, b, sight, out)
         see_network(state, b, sight, out)
         summarise(state, b, sight, out)
         if state.agents[b, viewer].free_at <= state.rows[b].clock and state.rows[b].acting != NOBODY:
-            write_action_mask(state, b, sight, out)
+            write_action_mask(startable, b, out)
 
 
 @kernel
@@ -141,8 +141,12 @@ def see_agents(state: State, b: int, viewer: int, sight: Sight, out: Arrays) -> 
 
 
 @kernel(error_model="numpy")
-def see_tasks(state: State, b: int, viewer: int, sight: Sight, out: Arrays) -> None:
-    """The placeholders and the tasks in sight, each as the viewer knows it."""
+def see_tasks(state: State, b: int, viewer: int, sight: Sight, out: Arrays) -> np.ndarray:
+    """The placeholders and the tasks in sight, each as the viewer knows it.
+
+    Returns bool (n,): the tasks that the viewer could start as far as it knows, those in sight that nobody has taken,
+    that it is eligible for, and all of whose predecessors are taken.
+    """
     row, tasks, lags, near = state.rows[b], state.tasks[b], state.lags[b], state.near[b]
     n, m = row.n_tasks, row.n_agents
     x, y = standpoint(state, b, viewer)
@@ -155,7 +159,7 @@ def see_tasks(state: State, b: int, viewer: int, sight: Sight, out: Arrays) -> N
         if sight.known[other] and sight.seen[other]:
             taken[count] = other
             count += 1
-    visible = 0
+    visible, startable = 0, np.zeros(n, np.bool_)
     for task in range(n):
         if not sight.seen[task]:
             continue
@@ -164,7 +168,8 @@ def see_tasks(state: State, b: int, viewer: int, sight: Sight, out: Arrays) -> N
         out.task_mask[b, task + 1] = 1
         describe_task(features, job, row.high, row.clock, x, y)
         describe_durations(features, pairs, viewer, sight.heard, row.high)
-        describe_waits(out.task[b], task, lags, taken[:count], sight.seen[:n])
+        unheeded = describe_waits(out.task[b], task, lags, taken[:count], sight.seen[:n])
+        startable[task] = not sight.known[task] and pairs[viewer].true > 0 and unheeded == 0
         if sight.known[task]:
             describe_commitment(features, sight.start[task] - row.clock, sight.finish[task] - row.clock, row.high)
             features[MINE] = job.agent == viewer
@@ -177,6 +182,7 @@ def see_tasks(state: State, b: int, viewer: int, sight: Sight, out: Arrays) -> N
             if pairs[viewer].true > 0:
                 features[EARLIEST_FINISH] = (earliest + pairs[viewer].planned) / row.high
     out.visible_share[b] = visible / n
+    return startable
 
 
 @kernel(error_model="numpy")
@@ -213,8 +219,8 @@ def describe_durations(features: np.ndarray, pairs: np.ndarray, viewer: int, hea
 
 
 @kernel(error_model="numpy")
-def describe_waits(features: np.ndarray, task: int, lags: np.ndarray, taken: np.ndarray, seen: np.ndarray) -> None:
-    """Count in float32 (slots, F) for how many tasks that are not in `taken`, int64 (k,), a task in sight waits.
+def describe_waits(features: np.ndarray, task: int, lags: np.ndarray, taken: np.ndarray, seen: np.ndarray) -> int:
+    """For how many tasks that are not in `taken`, int64 (k,), a task in sight waits; told in float32 (slots, F) too.
 
     Those in sight, bool (n,), that it waits for are told that one more waits for them.
     """
@@ -227,6 +233,7 @@ def describe_waits(features: np.ndarray, task: int, lags: np.ndarray, taken: np.
     for other in taken:
         unheeded -= lags[task, other] >= 0
     features[task + 1, WAITS_UNHEEDED] = unheeded
+    return unheeded
 
 
 @kernel(error_model="numpy")
@@ -341,13 +348,11 @@ def visible_bounds(
 
 
 @kernel(error_model="numpy")
-def write_action_mask(state: State, b: int, sight: Sight, out: Arrays) -> None:
-    """The actions that are legal as far as the viewer knows: free, eligible, and behind all that they wait for."""
-    for slot in range(1, state.rows[b].n_tasks + 1):
-        features = out.task[b, slot]
-        free = features[UNSCHEDULED] == 1.0 and features[ELIGIBLE] == 1.0
-        if out.task_mask[b, slot] == 1 and free and features[WAITS_UNHEEDED] == 0.0:
-            out.action_mask[b, slot] = 1
+def write_action_mask(startable: np.ndarray, b: int, out: Arrays) -> None:
+    """The actions that are legal as far as the viewer knows, from what `see_tasks` says it could start, bool (n,)."""
+    for task in range(len(startable)):
+        if startable[task]:
+            out.action_mask[b, task + 1] = 1
 
 
 @kernel(error_model="numpy")
