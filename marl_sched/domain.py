@@ -221,8 +221,22 @@ class Domain:
         return require(f"scale of {self.name}", scale, self.scales)
 
     def require_objective(self, objective: str) -> str:
-        """The objective's name, or UnknownNameError."""
-        return require(f"objective of {self.name}", objective, self.objectives)
+        """The objective's name, or UnknownNameError; one from outside may be named (marl_sched.objective)."""
+        from marl_sched.objective import objective_names, outside_objective
+
+        if outside_objective(self, objective) is not None:
+            return objective
+        return require(f"objective of {self.name}", objective, [*self.objectives, *objective_names(self.name)])
+
+    def make_simulator(self, instances: Sequence[Any], **options: Any) -> TurnSimulator:
+        """The domain's simulator of these instances; an objective from outside pays its rewards, if it is asked for."""
+        from marl_sched.objective import ScoredSimulator, outside_objective
+
+        name = options.get("objective")
+        outside = None if name is None else outside_objective(self, name)
+        if outside is None:
+            return self.simulator(instances, **options)
+        return ScoredSimulator(self.simulator(instances, **{**options, "objective": self.objectives[0]}), name, outside)
 
     @property
     def simulator_options(self) -> dict[str, Any]:

@@ -15,11 +15,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from marl_sched.domain import Domain, get_domain
 from marl_sched.errors import InvalidFileError, InvalidOptionError, require_integer
-from marl_sched.noise import as_seed
+from marl_sched.noise import as_seed, instance_generator
 
 if TYPE_CHECKING:
     from marl_sched.simulation import TurnSimulator
@@ -160,13 +158,13 @@ class Problem:
             "pad": self.pad,
             **self.options,
         }
-        return self.domain.simulator(instances, **{**arguments, **changes})
+        return self.domain.make_simulator(instances, **{**arguments, **changes})
 
     def episode(self, index: int) -> Any:
         """The instance of episode `index` of an environment that draws a new one for each; a given one is fixed."""
         if self.given is not None:
             return self.given[index % len(self.given)]
-        return self.domain.generate(str(self.scale), np.random.default_rng([self.seed, index]))
+        return self.domain.generate(str(self.scale), instance_generator(self.seed, index))
 
     def as_json(self) -> dict[str, Any]:
         """Plain data, schema 1, from which `from_json` makes an equal problem.

@@ -179,6 +179,11 @@ class TurnSimulator(ABC):
         return np.where(self.over, 1.0, self.progress / self.length)
 
     @property
+    def reward_parts(self) -> Mapping[str, np.ndarray]:
+        """The parts that the last step's `reward` is the sum of: name -> float64 (B,); empty where it has none."""
+        return {}
+
+    @property
     def presence(self) -> Mapping[str, np.ndarray]:
         """Node type -> bool (B, n), which padded slots hold a node now; types that are left out never change.
 

@@ -236,6 +236,7 @@ def _check_aec(problem: Problem, trace: Trace) -> None:
         view=problem.view,
         horizon=problem.horizon,
         objective=problem.objective,
+        split="test",
     )
     env.reset(seed=problem.seed)
     for number, turn in enumerate(trace):
@@ -265,6 +266,7 @@ def _check_torchrl(problem: Problem, trace: Trace) -> None:
         horizon=problem.horizon,
         objective=problem.objective,
         seed=problem.seed,
+        split="test",
     )
     state = env.reset()
     for number, turn in enumerate(trace):

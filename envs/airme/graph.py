@@ -75,9 +75,6 @@ def graph_spec(n_types: int) -> GraphSpec:
     )
 
 
-_BROKEN, _AGE = _PLANE.index("broken"), _PLANE.index("age_hours/10")
-
-
 def pressing(observation: Mapping[str, np.ndarray]) -> np.ndarray:
     """Broken planes that a crew sees as they are and that nobody has in hand, bool (B, P + 1).
 
@@ -85,7 +82,7 @@ def pressing(observation: Mapping[str, np.ndarray]) -> np.ndarray:
     plane stays broken for ever beside a crew with nothing to do.
     """
     plane = observation["plane"]
-    return (plane[..., _BROKEN] > 0) & (plane[..., _AGE] == 0) & (observation["action_mask"] > 0)
+    return (plane[..., BROKEN] > 0) & (plane[..., AGE] == 0) & (observation["action_mask"] > 0)
 
 
 class Arrays(NamedTuple):

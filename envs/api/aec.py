@@ -70,6 +70,8 @@ class SchedulingAEC(SchedulingEnvironment, AECEnv[str, Any, int]):
             "time": int(self.simulator.time[0]),
             VISIBLE_SHARE: float(seen[VISIBLE_SHARE]),
         }
+        if parts := self._single.reward_parts():
+            info["reward_parts"] = parts
         return self.layout.observation(seen, mask), info, mask
 
     def observe(self, agent: str) -> Any:

@@ -73,7 +73,7 @@ class SingleEpisode:
         self._fixed = None if instance is None else as_instance(self.domain, instance)
         self.split = split
         self.position = (fresh_seed() if seed is None else as_seed(seed)), -1
-        self.simulator = self.domain.simulator(
+        self.simulator = self.domain.make_simulator(
             [self._instance(0)],
             view=self.domain.make_view(view),
             objective=self.domain.objectives[0] if objective is None else objective,
@@ -135,6 +135,10 @@ class SingleEpisode:
         self._action[0] = action
         self.simulator.step(self._action)
         return float(self.simulator.reward[0])
+
+    def reward_parts(self) -> dict[str, float]:
+        """The parts of the reward of the last step, as an objective from outside names them; mostly none."""
+        return {name: float(values[0]) for name, values in self.simulator.reward_parts.items()}
 
     def as_action(self, agent: int, action: Any) -> int:
         """A given action as an integer in [0, max_actions), legal or not; IllegalActionError outside the space."""

@@ -37,13 +37,14 @@ class SchedulingParallel(SchedulingEnvironment, ParallelEnv[str, Any, int]):
         options: as SingleEpisode takes them, its `render_mode` included.
     """
 
-    changing = ("agents", "_masks", "_single.position")
+    changing = ("agents", "_masks", "_parts", "_single.position")
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observations, Infos]:
         """Start episode 0 of `seed`, or the next episode; `options={"instance": ...}` gives its instance."""
         self._single.reset(seed, options)
         self.agents = self._present()
         self._masks: dict[str, np.ndarray] = {}
+        self._parts: dict[str, float] = {}  # of the last step's reward
         return self._look(set(), set())
 
     def observe(self, agent: str) -> Any:
@@ -69,6 +70,8 @@ class SchedulingParallel(SchedulingEnvironment, ParallelEnv[str, Any, int]):
                 "time": int(self.simulator.time[0]),
                 VISIBLE_SHARE: share,
             }
+            if self._parts:
+                infos[agent]["reward_parts"] = dict(self._parts)
         return observations, infos
 
     def step(
@@ -135,11 +138,14 @@ class SchedulingParallel(SchedulingEnvironment, ParallelEnv[str, Any, int]):
         conflicts: set[int] = set()
         simulator = self.simulator
         pending = set(choices)
+        self._parts = {}
         while pending:
             agent = min((a for a in simulator.free_agents(0).tolist() if a in pending), key=losers.__contains__)
             pending.remove(agent)
             simulator.give_turn(0, agent)
             reward += self._single.step(choices[agent])
+            for name, part in self._single.reward_parts().items():
+                self._parts[name] = self._parts.get(name, 0.0) + part
             if simulator.conflict[0]:
                 conflicts.add(agent)
             if self._single.over or simulator.elapsed[0] > 0:

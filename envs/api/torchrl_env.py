@@ -95,7 +95,7 @@ class SchedulingTorchRL(SavesState, EnvBase):
         self._given = None if instances is None else [as_instance(self.domain, i) for i in instances]
         self.split = split
         self._set_seed(fresh_seed() if seed is None else seed)
-        self.simulator = self.domain.simulator(
+        self.simulator = self.domain.make_simulator(
             self._instances(range(rows), 0),
             view=self.domain.make_view(view),
             objective=self.domain.objectives[0] if objective is None else objective,
