@@ -1,8 +1,9 @@
 """How good choices were: estimators to choose from, along the team's sequence of turns or along an agent's own.
 
 Time passes only when all agents that are free have acted, so discounting is semi-Markov: a turn that lets
-e units of simulated time pass discounts what follows by gamma ** e, and by 1 within a decision epoch.
-Turns that are not valid (after an episode's end, or at its cut) may hold anything, NaN included, and get 0.
+e units of simulated time pass discounts what follows by gamma ** e, and by 1 within a decision epoch. TorchRL's value
+estimators know one discount for all steps, so discounts are worked out here and its functional form is called.
+What is not valid (a turn after an episode's end, the value of a state without a future) may be anything, NaN included.
 """
 
 from __future__ import annotations
@@ -16,8 +17,9 @@ def generalised_advantages(
     rewards: Tensor,
     elapsed: Tensor,
     values: Tensor,
-    valid: Tensor,
-    alive: Tensor,
+    next_values: Tensor,
+    boundary: Tensor,
+    terminated: Tensor,
     *,
     discount: float,
     gae_lambda: float,
@@ -27,36 +29,36 @@ def generalised_advantages(
     Args:
         rewards: float (T, B), what a turn brought.
         elapsed: int or float (T, B), the simulated time that it let pass.
-        values: float (T + 1, B), of the states in which turns were taken and of the last one reached.
-        valid: bool (T + 1, B), the turn was taken; an estimate reaches over valid turns only.
-        alive: bool (T + 1, B), the state has a future: its value counts even where no turn was taken in it,
-            as at the cut of an episode that could have gone on.
+        values: float (T, B), of the states in which turns were taken.
+        next_values: float (T, B), of the states that they led to.
+        boundary: bool (T, B), no later turn goes on from this one: an end, a cut, or the last of the rollout.
+        terminated: bool (T, B), the episode ended with the turn: what it led to has no value.
         discount: gamma, per unit of simulated time.
         gae_lambda: lambda, per unit of simulated time: how far credit reaches does not depend on how many agents
             act at a decision epoch.
     """
-    taken = valid[:-1]
-    passed = torch.where(taken, elapsed.double(), 0.0)
-    values = torch.where(alive, values.double(), 0.0)
+    passed = elapsed.double()
     advantages, targets = generalized_advantage_estimate(
         gamma=discount**passed,
         lmbda=gae_lambda**passed,
-        state_value=values[:-1],
-        next_state_value=values[1:],
-        reward=torch.where(taken, rewards.double(), 0.0),
-        done=~valid[1:],
-        terminated=~alive[1:],
+        state_value=values.double(),
+        next_state_value=torch.where(terminated, 0.0, next_values.double()),
+        reward=rewards.double(),
+        done=boundary,
+        terminated=terminated,
     )
-    return torch.where(taken, advantages, 0.0), torch.where(taken, targets, 0.0)
+    return advantages, targets
 
 
 def own_turn_advantages(
     rewards: Tensor,
     elapsed: Tensor,
     values: Tensor,
+    next_values: Tensor,
     agents: Tensor,
-    valid: Tensor,
-    alive: Tensor,
+    next_agents: Tensor,
+    boundary: Tensor,
+    terminated: Tensor,
     *,
     discount: float,
     gae_lambda: float,
@@ -66,42 +68,42 @@ def own_turn_advantages(
     To an agent a turn lasts until its next own one. It earns all that the team does in between, discounted to the
     turn's decision epoch, and what follows is discounted by gamma to the power of the time between.
 
-    At a cut and at the segment's end only one agent is about to act; the value of the others' future is not known.
+    At a cut and at the rollout's end only one agent is about to act; the value of the others' future is not known.
     An agent's last turn before it therefore is not learned from, it only serves the turn before as its future; where
     an episode truly ends nothing is lost. A turn after which an agent is busy for long is lost more often, so a
-    segment should be many jobs long.
+    rollout should be many jobs long.
 
-    `agents` int64 (T + 1, B) says who was to act, -1 where nobody was; the other arguments are as for
+    `agents` and `next_agents` int64 (T, B) say whose turn it was and who is to act next; the other arguments are as for
     `generalised_advantages`. Returns advantages and value targets, float64 (T, B), and bool
     (T, B), which turns are to be learned from.
     """
     turns, batch = rewards.shape
-    rows, owner = torch.arange(batch), agents.clamp(min=0)
-    values = torch.where(alive, values.double(), 0.0)
+    rows, count = torch.arange(batch), int(torch.maximum(agents, next_agents).max()) + 1
+    values, next_values = values.double(), torch.where(terminated, 0.0, next_values.double())
     advantages, targets = torch.zeros(2, turns, batch, dtype=torch.float64)
     loss_mask = torch.zeros(turns, batch, dtype=torch.bool)
     # of each agent, (B, A): its next own turn's value and advantage, what is earned and how long it takes until then
-    following, credit, earned, passed = torch.zeros(4, batch, int(owner.max()) + 1, dtype=torch.float64)
+    following, credit, earned, passed = torch.zeros(4, batch, max(count, 1), dtype=torch.float64)
     known = torch.zeros_like(following, dtype=torch.bool)  # that value is known; an end's is 0
-    for t in reversed(range(turns + 1)):
-        taken = valid[t] if t < turns else torch.zeros_like(valid[t])
-        for books in (following, credit, earned, passed):
-            books[~taken] = 0.0
-        known[~taken] = ~alive[t, ~taken, None]
-        who = owner[t]
-        if t < turns:
-            span = torch.where(taken, elapsed[t].double(), 0.0)[:, None]
-            earned = torch.where(taken, rewards[t].double(), 0.0)[:, None] + discount**span * earned
-            passed = passed + span
-            loss_mask[t] = taken & known[rows, who]
-            discounted = discount ** passed[rows, who]
-            target = earned[rows, who] + discounted * following[rows, who]
-            target = target + discounted * gae_lambda ** passed[rows, who] * credit[rows, who]
-            advantages[t] = torch.where(loss_mask[t], target - values[t], 0.0)
-            targets[t] = torch.where(loss_mask[t], target, 0.0)
-            credit[rows, who] = advantages[t]
-        following[rows, who] = values[t]
-        known[rows, who] |= taken | alive[t]
+    for t in reversed(range(turns)):
+        last = boundary[t]
+        for account in (following, credit, earned, passed):
+            account[last] = 0.0
+        known[last] = terminated[t, last, None]
+        cut, heir = last & ~terminated[t], next_agents[t].clamp(min=0)
+        following[rows, heir] = torch.where(cut, next_values[t], following[rows, heir])
+        known[rows, heir] |= cut
+        who, span = agents[t].clamp(min=0), elapsed[t].double()[:, None]
+        earned = rewards[t].double()[:, None] + discount**span * earned
+        passed = passed + span
+        loss_mask[t] = (agents[t] >= 0) & known[rows, who]
+        discounted = discount ** passed[rows, who]
+        target = earned[rows, who] + discounted * following[rows, who]
+        target = target + discounted * gae_lambda ** passed[rows, who] * credit[rows, who]
+        advantages[t] = torch.where(loss_mask[t], target - values[t], 0.0)
+        targets[t] = torch.where(loss_mask[t], target, 0.0)
+        credit[rows, who] = advantages[t]
+        following[rows, who], known[rows, who] = values[t], True
         earned[rows, who] = passed[rows, who] = 0.0
     return advantages, targets, loss_mask
 

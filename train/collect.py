@@ -1,105 +1,136 @@
 """Sampling turns: whole batches of instances in lock-step, one forward pass for the acting agents of all rows.
 
-Two ways to cut experience into updates. `EpisodeCollector` plays whole episodes from the start; rows that
-end early are masked. `SegmentCollector` plays a fixed number of turns in every row and goes on from there in
-the next update; a row that reaches its episode's length is observed once more, for the value of what
-would have followed, and begins a new instance.
-
-Both play on the TorchRL environment. Everything random is named by numbers (which episode of the run a row
-plays, counter-based noise), so a collector's state is small: each row's episode and what has been chosen in
-it so far. Resuming replays the choices.
+Two ways to cut experience into updates. `EpisodeCollector` plays whole episodes from the start, all rows together;
+rows that end early are masked. `SegmentCollector` plays a fixed number of turns in every row and goes on from there in
+the next update, by one of TorchRL's collectors: `sync` in this process, `multi` in processes of this machine, `ray` in
+actors of a Ray cluster. An environment cuts a row's episode at its length and begins a new instance; the state reached
+is in `("next", ...)`, for the value of what would have followed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import time
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from functools import partial
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.collectors import Collector as SyncCollector
+from torchrl.collectors import MultiSyncCollector
 
-from marl_sched.domain import Domain
-from marl_sched.envs.api.torchrl_env import SchedulingTorchRL
-from marl_sched.noise import instance_generator
+from marl_sched.agents.networks.network import PolicyNetwork
+from marl_sched.errors import InvalidOptionError, MarlSchedError
+from marl_sched.train.actor import LOG_PROB, ActingLogits, actor
+from marl_sched.train.device import device_of
+from marl_sched.train.environment import TrainingEnv, TrainingTask
 
-Act = Callable[[dict[str, Tensor], np.ndarray], tuple[Tensor, Tensor]]
-"""(observations, uniforms float64 (B,)) -> actions int64 (B,) and their log-probabilities float32 (B,)."""
+CollectorName = Literal["sync", "multi", "ray"]
+_NO_LIMIT = 2**31 - 1  # turns of an episode
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rollout:
-    """T turns of B rows, and the state that the last turn led to.
+    """T turns of B rows.
 
     Attributes:
-        observation: what acting agents saw, name -> (T + 1, B, ...).
-        central: the same under the full view; the same object where the view is full.
-        actions: int64 (T, B).
-        log_probs: float32 (T, B), of the actions under the policy that chose them.
-        rewards, elapsed: float64 and int64 (T, B).
-        times: int64 (T + 1, B), simulated time at each turn.
-        agents: int64 (T + 1, B), whose turn it is, -1 where nobody's.
-        valid: bool (T + 1, B), a turn that was taken and counts; what the others hold is meaningless.
-        alive: bool (T + 1, B), the state has a future; true at a cut, where no turn is valid.
-        length: episode length in simulated time.
+        data: batch (B, T), the environment's entries (marl_sched.train.environment) in the states in which turns were
+            taken, with `action`, `action_log_prob` and, under `next`, what came of them.
+        valid: bool (T, B), a turn that counts; what the others hold is meaningless.
+        boundary: bool (T, B), no later turn of this rollout goes on from this one: the episode ended, was cut, or the
+            rollout ends.
+        terminated: bool (T, B), the episode ended, and there is no future to value.
+        length: of the episodes, in the domain's unit.
+        time_limit: simulated time at which an episode of that length is over; None: it follows from what happens.
+        seconds: wall time that collecting took.
     """
 
-    observation: dict[str, Tensor]
-    central: dict[str, Tensor]
-    actions: Tensor
-    log_probs: Tensor
-    rewards: Tensor
-    elapsed: Tensor
-    times: Tensor
-    agents: Tensor
+    data: TensorDictBase
     valid: Tensor
-    alive: Tensor
+    boundary: Tensor
+    terminated: Tensor
     length: int
+    time_limit: int | None
+    seconds: float = 0.0
+
+    def column(self, *name: str) -> Tensor:
+        """An entry of one number per turn as (T, B)."""
+        return self.data[name].flatten(2).squeeze(-1).T if self.data[name].dim() > 2 else self.data[name].T
+
+    @property
+    def turns(self) -> int:
+        """T."""
+        return int(self.data.shape[1])
+
+    @property
+    def actions(self) -> Tensor:
+        """Int64 (T, B)."""
+        return self.column("action")
+
+    @property
+    def log_probs(self) -> Tensor:
+        """Float32 (T, B), of the actions under the policy that chose them."""
+        return self.column(LOG_PROB)
+
+    @property
+    def rewards(self) -> Tensor:
+        """Float64 (T, B), what the turns brought."""
+        return self.column("next", "reward")
+
+    @property
+    def elapsed(self) -> Tensor:
+        """Int64 (T, B), simulated time that the turns let pass."""
+        return self.column("next", "elapsed")
+
+    @property
+    def times(self) -> Tensor:
+        """Int64 (T, B), simulated time of the turns."""
+        return self.column("time").long()
+
+    @property
+    def agents(self) -> Tensor:
+        """Int64 (T, B), whose turn it was."""
+        return self.column("acting")
+
+    @property
+    def horizon(self) -> int:
+        """Simulated time at which the longest valid turn is over, or that at which episodes are cut, if it is known."""
+        if self.time_limit is not None:
+            return self.time_limit
+        return int((self.times + self.elapsed)[self.valid].max())
 
     @property
     def reward_rate(self) -> float:
         """Reward per unit of simulated time over all valid turns: M1 of the sampling policy."""
-        valid = self.valid[:-1]
-        return float(self.rewards[valid].sum() / max(self.time, 1))
+        return float(self.rewards[self.valid].sum() / max(self.time, 1))
 
     @property
     def time(self) -> int:
         """Simulated time that passed in valid turns, over all rows."""
-        return int(self.elapsed[self.valid[:-1]].sum())
+        return int(self.elapsed[self.valid].sum())
 
     @property
     def decisions(self) -> int:
         """Number of valid turns."""
-        return int(self.valid[:-1].sum())
-
-
-class InstanceSource:
-    """The instances of a run: of `rows` rows, row b's episode n plays instance (n rows + b) // episodes.
-
-    An instance depends on (seed, its number) and on its scale, and scales take turns. All are of the split "train",
-    which neither validation nor evaluation meets.
-    """
-
-    def __init__(self, domain: Domain, scales: Sequence[str], *, seed: int, rows: int, episodes: int = 1) -> None:
-        self._domain, self._scales, self._seed = domain, tuple(scales), seed
-        self._rows, self._episodes = rows, episodes
-
-    def __call__(self, row: int, count: int) -> Any:
-        """The instance that a row plays in its episode `count`."""
-        number = (count * self._rows + row) // self._episodes
-        rng = instance_generator(self._seed, number, "train")
-        return self._domain.generate(self._scales[number % len(self._scales)], rng)
+        return int(self.valid.sum())
 
 
 class Collector(Protocol):
-    """What the training loop asks for."""
+    """What the training loop asks for.
 
-    env: SchedulingTorchRL
+    Attributes:
+        name: as in the configuration.
+        env: an environment of the same kind, for its metagraph and sizes.
+    """
 
-    def collect(self, act: Act, length: int) -> Rollout:
-        """Play with `act`; episodes that begin now have that length."""
+    name: str
+    env: TrainingEnv
+
+    def collect(self, policy: PolicyNetwork, length: int) -> Rollout:
+        """Play with the policy's present parameters; episodes that begin now have that length."""
 
     def state(self) -> dict[str, np.ndarray]:
         """What a resumed run needs to go on."""
@@ -107,73 +138,39 @@ class Collector(Protocol):
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Go on from a saved state; the collector must be new."""
 
-
-class _Recorder:
-    """Takes turns in the environment and keeps them; lists of per-turn tensors become a Rollout."""
-
-    def __init__(self, env: SchedulingTorchRL, central: bool) -> None:
-        self._env, self._central = env, central
-        self._names = list(env.simulator.arrays)
-        self._columns: dict[str, list[Tensor]] = {}
-        self._views: tuple[list[dict[str, Tensor]], list[dict[str, Tensor]]] = ([], [])
-
-    def observe(self, state: TensorDictBase, valid: np.ndarray, alive: np.ndarray) -> None:
-        """Keep a state, in which the acting agents of `valid` rows are about to choose."""
-        simulator = self._env.simulator
-        self._views[0].append({name: state[name] for name in self._names})
-        if self._central:
-            self._views[1].append({name: torch.from_numpy(a) for name, a in simulator.observe_all().items()})
-        self._keep(valid=torch.from_numpy(valid), alive=torch.from_numpy(alive))
-        self._keep(times=torch.from_numpy(simulator.time.copy()), agents=torch.from_numpy(simulator.acting.copy()))
-
-    def step(self, state: TensorDictBase, act: Act) -> tuple[TensorDictBase, Tensor]:
-        """Take a turn; the next state and the actions chosen."""
-        simulator = self._env.simulator
-        actions, log_probs = act(self._views[0][-1], simulator.policy_noise(simulator.acting))
-        after = self._env.step(state.set("action", actions))["next"]
-        self._keep(actions=actions, log_probs=log_probs)
-        self._keep(rewards=after["reward"].squeeze(-1), elapsed=after["elapsed"])
-        return after, actions
-
-    def _keep(self, **columns: Tensor) -> None:
-        for name, column in columns.items():
-            self._columns.setdefault(name, []).append(column)
-
-    def rollout(self, length: int) -> Rollout:
-        """Everything kept so far."""
-        observation = _stacked(self._views[0])
-        central = _stacked(self._views[1]) if self._central else observation
-        columns = {name: torch.stack(kept) for name, kept in self._columns.items()}
-        return Rollout(observation=observation, central=central, length=length, **columns)
-
-
-def _stacked(views: list[dict[str, Tensor]]) -> dict[str, Tensor]:
-    return {name: torch.stack([view[name] for view in views]) for name in views[0]}
+    def close(self) -> None:
+        """End workers."""
 
 
 class EpisodeCollector:
-    """Whole episodes: every call resets all rows.
+    """Whole episodes: every call resets all rows, and plays in this process."""
 
-    Args:
-        env: whose horizon lies beyond every cut.
-        central: record the full view beside the agents' own.
-    """
+    name = "sync"
 
-    def __init__(self, env: SchedulingTorchRL, *, central: bool) -> None:
-        self.env, self._central, self._resets = env, central, 0
+    def __init__(self, task: TrainingTask) -> None:
+        self.env, self._resets = task.environment(), 0
 
-    def collect(self, act: Act, length: int) -> Rollout:
+    def collect(self, policy: PolicyNetwork, length: int) -> Rollout:
         """Play every row until it ends or `length` has passed; what follows a cut counts for nothing."""
-        state = self.env.reset()
+        started = time.perf_counter()
+        module = ActingLogits(policy)
+        module.prepare()
+        self.env.episode_length = length
         self._resets += 1
-        recorder = _Recorder(self.env, self._central)
-        while True:
-            simulator = self.env.simulator
-            playing = ~simulator.over & (simulator.time < length)
-            recorder.observe(state, playing, playing)
-            if not playing.any():
-                return recorder.rollout(length)
-            state, _ = recorder.step(state, act)
+        with torch.no_grad():
+            data = self.env.rollout(_NO_LIMIT, actor(module), break_when_any_done=False, break_when_all_done=True)
+        over = data["next", "done"].squeeze(-1).T
+        valid = torch.cat([torch.ones_like(over[:1]), ~over[:-1]])
+        terminated = data["next", "terminated"].squeeze(-1).T
+        return Rollout(
+            data=data,
+            valid=valid,
+            boundary=over,
+            terminated=terminated,
+            length=length,
+            time_limit=_time_limit(self.env, length),
+            seconds=time.perf_counter() - started,
+        )
 
     def state(self) -> dict[str, np.ndarray]:
         """How often the rows were reset."""
@@ -185,83 +182,158 @@ class EpisodeCollector:
             self.env.reset()
             self._resets += 1
 
+    def close(self) -> None:
+        """There are no workers."""
+
 
 class SegmentCollector:
-    """`turns` turns of every row in each call; rows play on from call to call.
+    """`task.turns` turns of every row in each call, in this process; rows play on from call to call."""
 
-    The first episodes of the rows are cut at different times, so that from then on every part of an episode
-    is in every update.
+    name: str = "sync"
 
-    Args:
-        env: whose horizon lies beyond every cut.
-        turns: T of every rollout.
-        length: of the first episodes.
-        central: record the full view beside the agents' own.
-    """
+    def __init__(self, task: TrainingTask) -> None:
+        if task.turns is None:
+            raise InvalidOptionError("collector: expected a task with a number of turns for each update, got None")
+        self.task, self.env, self._turns = task, task.environment(), task.turns
+        self._module: ActingLogits | None = None
+        self._collector: Any = None
+        self._batches: Iterator[TensorDictBase] = iter(())
 
-    def __init__(self, env: SchedulingTorchRL, *, turns: int, length: int, central: bool) -> None:
-        rows = env.batch_size[0]
-        self.env, self._turns, self._central = env, turns, central
-        self._cut = np.maximum(length * np.arange(1, rows + 1) // rows, 1)
-        self._resets = np.ones(rows, np.int64)
-        self._taken = np.zeros(rows, np.int64)  # turns since a row's episode began
-        self._chosen = np.zeros((rows, turns), np.int64)  # the actions chosen in them
-        self._state = env.reset()
+    def collect(self, policy: PolicyNetwork, length: int) -> Rollout:
+        """Play on; `length` is what the environment's curriculum gives to rows that begin in this update."""
+        started = time.perf_counter()
+        if self._module is None:
+            self._module = ActingLogits(policy)
+            self._collector = self._start(self._module)
+            self._batches = iter(self._collector)
+        elif self._module.network is not policy:
+            raise InvalidOptionError("collect: expected the policy with which the collector began")
+        self._synchronise(self._module)
+        data = next(self._batches)
+        done = data["next", "done"].squeeze(-1).T
+        boundary = done.clone()
+        boundary[-1] = True
+        return Rollout(
+            data=data,
+            valid=torch.ones_like(done),
+            boundary=boundary,
+            terminated=data["next", "terminated"].squeeze(-1).T,
+            length=length,
+            time_limit=None,
+            seconds=time.perf_counter() - started,
+        )
 
-    def collect(self, act: Act, length: int) -> Rollout:
-        """Play on; rows that begin a new episode are cut after `length`."""
-        simulator = self.env.simulator
-        recorder = _Recorder(self.env, self._central)
-        for turn in range(self._turns + 1):
-            alive = ~simulator.over
-            valid = alive & (simulator.time < self._cut)
-            recorder.observe(self._state, valid, alive)
-            if turn < self._turns:
-                self._state, actions = recorder.step(self._state, act)
-                self._remember(actions.numpy())
-                self._begin(~valid, length)
-        return recorder.rollout(length)
-
-    def _remember(self, actions: np.ndarray) -> None:
-        if self._taken.max() == self._chosen.shape[1]:
-            self._chosen = np.concatenate([self._chosen, np.zeros_like(self._chosen)], axis=1)
-        self._chosen[np.arange(len(actions)), self._taken] = actions
-        self._taken += 1
-
-    def _begin(self, rows: np.ndarray, length: int) -> None:
-        """New episodes in `rows`, bool (B,)."""
-        if rows.any():
-            self._cut[rows], self._taken[rows] = length, 0
-            self._reset(rows)
-
-    def _reset(self, rows: np.ndarray) -> None:
-        self._resets[rows] += 1
-        self._state = self.env.reset(self._state.set("_reset", torch.from_numpy(rows)[:, None]))
-
-    def state(self) -> dict[str, np.ndarray]:
-        """How often each row was reset, where its episode is cut, and what was chosen in it so far."""
-        chosen = self._chosen[:, : max(int(self._taken.max()), 1)]
+    def _options(self) -> dict[str, Any]:
+        """What all of TorchRL's collectors are told."""
         return {
-            "resets": self._resets.copy(),
-            "cut": self._cut.copy(),
-            "taken": self._taken.copy(),
-            "chosen": chosen.copy(),
+            "frames_per_batch": self.task.rows * self._turns,
+            "total_frames": -1,
+            "use_buffers": False,
+            "auto_register_policy_transforms": False,
         }
 
-    def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Replay the choices: a row with fewer of them starts later, so that all end together.
+    def _start(self, module: ActingLogits) -> Any:
+        device = device_of(module.network)
+        return SyncCollector(
+            self.env, actor(module), policy_device=device, env_device="cpu", storing_device="cpu",
+            track_traj_ids=False, **self._options(),
+        )  # fmt: skip
 
-        Rows in their first episode have most choices and start at once: the constructor has reset them.
-        """
-        self._cut, self._taken, self._chosen = (np.array(state[name]) for name in ("cut", "taken", "chosen"))
-        last, rows = state["resets"], np.arange(len(self._taken))
-        while (self._resets < last - 1).any():
-            self._reset(self._resets < last - 1)
-        for left in range(int(self._taken.max()), -1, -1):
-            starting = (self._taken == left) & (self._resets < last)
-            if starting.any():
-                self._reset(starting)
-            if left > 0:
-                replayed = self._taken - left  # negative before a row has started, whose turns do not matter
-                actions = np.where(replayed >= 0, self._chosen[rows, np.maximum(replayed, 0)], 0)
-                self._state = self.env.step(self._state.set("action", torch.from_numpy(actions)))["next"]
+    def _synchronise(self, module: ActingLogits) -> None:
+        """Let the collector act with the policy's present parameters, which here are its own."""
+        module.prepare()
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Where the environment stands."""
+        return self.env.state_arrays()
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Go on exactly as the collector that was saved."""
+        self.env.load_arrays(state)
+
+    def close(self) -> None:
+        """Let TorchRL's collector go."""
+        if self._collector is not None:
+            self._collector.shutdown()
+            self._collector = None
+
+
+class WorkerCollector(SegmentCollector):
+    """The same turns in several workers, each of which holds a part of the rows.
+
+    With the same parameters the workers' rows play as those of `sync` do, as noise and choices are counter-based. A run
+    that is resumed does not go on exactly: rows begin new episodes, none of which has been played before.
+
+    Args:
+        task: what is played.
+        workers: number of workers, at most one per row.
+    """
+
+    def __init__(self, task: TrainingTask, workers: int) -> None:
+        if task.rows % workers:
+            raise InvalidOptionError(
+                f"workers: expected a divisor of the {task.rows} rows that play at once (algorithm.instances), "
+                f"got {workers}"
+            )
+        super().__init__(task)
+        self._workers, self._updates, self._skip = workers, 0, 0
+
+    def collect(self, policy: PolicyNetwork, length: int) -> Rollout:
+        """See SegmentCollector."""
+        self._updates += 1
+        return super().collect(policy, length)
+
+    def _factories(self) -> list[Any]:
+        from dataclasses import replace
+
+        task, rows = replace(self.task, skip=self._skip), self.task.rows // self._workers
+        return [partial(task.environment, first, rows) for first in range(0, task.rows, rows)]
+
+    def _synchronise(self, module: ActingLogits) -> None:
+        self._collector.update_policy_weights_()
+
+    def state(self) -> dict[str, np.ndarray]:
+        """More episodes than any row can have begun: an episode has at least one turn."""
+        return {"skip": np.array([self._skip + self._updates * self._turns])}
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Begin with episodes that have not been played."""
+        self._skip = int(state["skip"][0])
+
+
+class MultiCollector(WorkerCollector):
+    """Workers are processes of this machine."""
+
+    name = "multi"
+
+    def _start(self, module: ActingLogits) -> Any:
+        return MultiSyncCollector(
+            self._factories(), actor(module), cat_results=0, storing_device="cpu", **self._options()
+        )
+
+
+class RayCollector(WorkerCollector):
+    """Workers are actors of a Ray cluster; needs the extra `cluster`."""
+
+    name = "ray"
+
+    def _start(self, module: ActingLogits) -> Any:
+        try:
+            from torchrl.collectors.distributed import RayCollector as TorchRLRay
+        except ImportError as error:
+            raise MarlSchedError(
+                "collector=ray: expected ray to be installed: pip install 'marl-sched[cluster]'"
+            ) from error
+        return TorchRLRay(self._factories(), actor(module), sync=True, **self._options())
+
+
+def segment_collector(task: TrainingTask, name: CollectorName, workers: int) -> SegmentCollector:
+    """The collector of that name."""
+    if name == "sync":
+        return SegmentCollector(task)
+    return (MultiCollector if name == "multi" else RayCollector)(task, workers)
+
+
+def _time_limit(env: TrainingEnv, length: int) -> int | None:
+    """When an episode of that length is over, where the domain counts its length in simulated time."""
+    return length if env.simulator.unit == env.simulator.time_unit else None

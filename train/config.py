@@ -28,6 +28,7 @@ from marl_sched.errors import InvalidFileError, InvalidOptionError
 from marl_sched.files import read_json
 from marl_sched.train.algorithms.base import AlgorithmConfig, algorithm_config
 from marl_sched.train.bounds import Count, Group, Natural, NonNegative, Seed
+from marl_sched.train.collect import CollectorName
 from marl_sched.train.device import DeviceName
 from marl_sched.train.groups import chosen_domain, offer
 
@@ -76,6 +77,13 @@ class ValidationConfig(Group, frozen=True, kw_only=True):
     mode: Mode
 
 
+class CollectorConfig(Group, frozen=True, kw_only=True):
+    """How turns are collected: see marl_sched.train.collect. `workers` are those of multi and ray."""
+
+    name: CollectorName
+    workers: Count
+
+
 class TrainConfig(Group, frozen=True, kw_only=True):
     """A whole run; `configs/train.yaml`. `start_from`: a policy, by name or path, to go on from.
 
@@ -86,6 +94,7 @@ class TrainConfig(Group, frozen=True, kw_only=True):
     view: dict[str, Any]
     policy: NetworkConfig
     algorithm: AlgorithmConfig
+    collector: CollectorConfig
     curriculum: CurriculumConfig
     validation: ValidationConfig
     start_from: str | None

@@ -6,10 +6,15 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from marl_sched.train.collect import Rollout
 from marl_sched.train.device import device_of
+from marl_sched.train.environment import CENTRAL
+
+TIME_LEFT = "time_left"  # what a critic may be told beside the graph, float32, in the domain's unit
+_PART = 1024  # states that a critic is asked about at once
 
 
 @dataclass(frozen=True)
@@ -53,14 +58,30 @@ def explained_variance(targets: Tensor, values: Tensor, loss_mask: Tensor) -> fl
     return float(1 - residual / targets[loss_mask].var(correction=0).clamp(min=1e-12))
 
 
-@torch.inference_mode()
-def values_of(critic: nn.Module, rollout: Rollout) -> Tensor:
-    """A critic's values (T + 1, B) of a rollout's states, a few turns at a time to keep memory small.
+@torch.no_grad()
+def values_of(critic: nn.Module, rollout: Rollout) -> tuple[Tensor, Tensor]:
+    """A critic's values of the states in which turns were taken and of those that they led to, float32 (T, B) each.
 
-    The critic is asked on its own device, its values come back to the rollout's, the CPU.
+    The critic is asked on its own device, a part of the rows at a time to keep memory small; its values come back to
+    the rollout's, the CPU. Where a turn is followed by another one of the same episode, the state that it led to is
+    that turn's; of the others only those with a future are asked about, the rest get 0.
     """
-    values, device = [], device_of(critic)
-    for start in range(0, rollout.times.shape[0], 8):
-        part = {name: v[start : start + 8].flatten(0, 1).to(device) for name, v in rollout.central.items()}
-        values.append(critic(part).unflatten(0, (-1, rollout.times.shape[1])))
-    return torch.cat(values).cpu()
+    values = _in_parts(critic, seen_by_critic(rollout.data).flatten(0, 1)).view(rollout.data.shape).T
+    following = torch.cat([values[1:], torch.zeros_like(values[:1])])
+    needed = rollout.boundary & ~rollout.terminated & rollout.valid
+    turn, row = needed.nonzero(as_tuple=True)
+    following = torch.where(rollout.boundary, 0.0, following)
+    if len(turn):
+        following[turn, row] = _in_parts(critic, seen_by_critic(rollout.data["next"])[row, turn])
+    return values, following
+
+
+def seen_by_critic(states: TensorDictBase) -> TensorDictBase:
+    """What a critic is shown of states: the central graph where it was recorded, else what the acting agent sees."""
+    central = states.get(CENTRAL, None)
+    return states if central is None else central
+
+
+def _in_parts(critic: nn.Module, states: TensorDictBase) -> Tensor:
+    device = device_of(critic)
+    return torch.cat([critic(part.to(device)).cpu() for part in states.split(_PART)])

@@ -59,7 +59,7 @@ class PolicyGradient:
         if not estimate.loss_mask.any():
             raise InvalidOptionError(
                 f"algorithm.turns: expected a segment in which turns can be told from what follows them, got one of "
-                f"{len(rollout.actions)} turns of which none can"
+                f"{rollout.turns} turns of which none can"
             )
         samples = samples_of(self.policy, rollout, estimate, self._ppo.config.min_keep_prob, rng)
         report = self._ppo.update(samples, progress, rng)

@@ -1,27 +1,33 @@
-"""Proximal policy optimisation (dissertation, equation 6.8) over turns of which only the valid ones count."""
+"""Proximal policy optimisation (dissertation, equation 6.8): TorchRL's `ClipPPOLoss` over the turns that count.
+
+The loss is asked for its terms per sample, which our weights and masks then reduce.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 from msgspec import Meta
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
+from torchrl.objectives import ClipPPOLoss
 
 from marl_sched.agents.networks.compaction import compacted
 from marl_sched.agents.networks.network import PolicyNetwork
-from marl_sched.agents.policies.network_policy import inverse_distribution
 from marl_sched.errors import InvalidOptionError
 from marl_sched.graph import ACTION_MASK
+from marl_sched.train.actor import LOG_PROB, Logits, actor
 from marl_sched.train.advantages import normalised
 from marl_sched.train.bounds import Count, Group, NonNegative, Positive
 from marl_sched.train.collect import Rollout
 from marl_sched.train.device import device_of
-from marl_sched.train.estimators import Estimate
+from marl_sched.train.environment import CENTRAL
+from marl_sched.train.estimators import TIME_LEFT, Estimate, seen_by_critic
 
 VALUE_WEIGHT = 0.5
 
@@ -48,7 +54,11 @@ class PpoConfig(Group, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class UpdateReport:
-    """Means over the minibatches of an update: entropy in nats, approximate KL divergence of new from old policy."""
+    """Means over the minibatches of an update.
+
+    Entropy (nats), KL divergence of new from old policy and the clipped share are those that TorchRL's loss reports,
+    over samples without their weights.
+    """
 
     policy_loss: float
     value_loss: float
@@ -58,30 +68,9 @@ class UpdateReport:
     gradient: float
 
 
-class Sampler:
-    """Samples a policy by inverse distribution, as an `Act` for collectors; see marl_sched.train.collect.
-
-    Observations and choices are on the CPU, logits are computed where the network is.
-    """
-
-    def __init__(self, network: PolicyNetwork) -> None:
-        self._network, self._device = network, device_of(network)
-        with torch.inference_mode():
-            self._weights = network.weights()
-
-    @torch.inference_mode()
-    def __call__(self, observation: dict[str, Tensor], uniform: np.ndarray) -> tuple[Tensor, Tensor]:
-        """Actions int64 (B,) and log-probabilities float32 (B,)."""
-        visible, names = _as_read(self._network, observation)
-        there = {name: values.to(self._device) for name, values in visible.items()}
-        log_probs = self._network(there, self._weights).log_softmax(-1).cpu()
-        picked = torch.from_numpy(inverse_distribution(log_probs.numpy(), uniform))[:, None]
-        return names.gather(1, picked).squeeze(1), log_probs.gather(1, picked).squeeze(1)
-
-
 def importance_subsample(
     policy: PolicyNetwork, rollout: Rollout, loss_mask: Tensor, min_keep_prob: float, rng: np.random.Generator
-) -> tuple[TensorDict, Tensor, Tensor]:
+) -> tuple[TensorDict, Tensor, tuple[Tensor, Tensor]]:
     """Turns of a rollout as a flat TensorDict of compacted graphs, with weights.
 
     Turns outside `loss_mask`, bool (T, B), are left behind here, whatever they hold. Of the others a turn is
@@ -91,43 +80,39 @@ def importance_subsample(
 
     Raises InvalidOptionError if none is kept.
     Returns the samples, the action that each decision node of theirs stands for, int64 (N, n_kept), and
-    the row of the flattened rollout (T B) that each comes from, int64 (N,).
+    the turn and the row of the rollout that each comes from, int64 (N,) each.
     """
     certainty = torch.where(loss_mask, rollout.log_probs, 0.0).exp()
     keep = (1 - certainty).clamp(min_keep_prob, 1.0)
-    rows = (loss_mask & (torch.from_numpy(rng.random(loss_mask.shape)) < keep)).flatten().nonzero().squeeze(1)
-    if not len(rows):
+    kept = loss_mask & (torch.from_numpy(rng.random(loss_mask.shape)) < keep)
+    turn, row = kept.nonzero(as_tuple=True)
+    if not len(row):
         raise InvalidOptionError(
             f"train: none of the {int(loss_mask.sum())} turns of an update that count was kept to learn from; expected "
             "more instances, longer segments (algorithm.turns) or a larger share of certain turns (min_keep_prob)"
         )
-    observation, names = _as_read(policy, _picked(rollout.observation, rows))
-    data = {"observation": observation, "weight": (1 / keep).flatten()[rows]}
-    return TensorDict(data, batch_size=[len(rows)]), names, rows
+    names = Logits(policy).in_keys
+    observation, actions = _as_read(policy, rollout.data.select(*names)[row, turn].to_dict())
+    data = {**observation, "uniform": rollout.data["uniform"][row, turn], "weight": (1 / keep)[turn, row]}
+    return TensorDict(data, batch_size=[len(row)]), actions, (turn, row)
 
 
 def samples_of(
     policy: PolicyNetwork, rollout: Rollout, estimate: Estimate, min_keep_prob: float, rng: np.random.Generator
 ) -> TensorDict:
     """Turns to learn from (`importance_subsample`), with what was chosen, normalised advantages and value targets."""
-    samples, names, rows = importance_subsample(policy, rollout, estimate.loss_mask, min_keep_prob, rng)
-
-    def pick(values: Tensor) -> Tensor:
-        return values.flatten(0, 1)[rows]
-
-    samples["target"] = (names == pick(rollout.actions)[:, None]).int().argmax(1)
-    samples["log_prob"] = pick(rollout.log_probs)
-    samples["advantage"] = pick(normalised(estimate.advantages, estimate.loss_mask)).float()
+    samples, names, (turn, row) = importance_subsample(policy, rollout, estimate.loss_mask, min_keep_prob, rng)
+    samples["action"] = (names == rollout.actions[turn, row][:, None]).int().argmax(1)
+    samples[LOG_PROB] = rollout.log_probs[turn, row]
+    advantages = normalised(estimate.advantages, estimate.loss_mask)[turn, row]
+    samples["advantage"] = advantages.float()[:, None]
     if estimate.value_targets is not None:
-        samples["value_target"] = pick(estimate.value_targets).float()
-        if rollout.central is not rollout.observation:
-            samples["central"], _ = compacted(policy.spec, _picked(rollout.central, rows))
+        samples["value_target"] = estimate.value_targets[turn, row].float()[:, None]
+        if rollout.data.get(CENTRAL, None) is not None:
+            samples[CENTRAL], _ = compacted(policy.spec, rollout.data[CENTRAL][row, turn].to_dict())
+        if rollout.data.get(TIME_LEFT, None) is not None:
+            samples[TIME_LEFT] = rollout.data[TIME_LEFT][row, turn]
     return samples
-
-
-def _picked(columns: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
-    """Rows, int64 (N,), of columns (T + 1, B, ...) laid out flat."""
-    return {name: values.flatten(0, 1)[rows] for name, values in columns.items()}
 
 
 def _as_read(network: PolicyNetwork, observation: Mapping[str, Tensor]) -> tuple[Mapping[str, Tensor], Tensor]:
@@ -138,17 +123,18 @@ def _as_read(network: PolicyNetwork, observation: Mapping[str, Tensor]) -> tuple
     return observation, torch.arange(actions[1]).expand(actions)
 
 
-def policy_loss(
-    logits: Tensor, actions: Tensor, old_log_probs: Tensor, advantages: Tensor, clip: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Per sample: minus the clipped surrogate of equation 6.8, the probability ratio, and the entropy, (N,) each.
+class Values(TensorDictModuleBase):
+    """A critic that reads a tensordict and writes `state_value`, float (N, 1), as TorchRL's losses ask it."""
 
-    logits float (N, n_actions), the lowest finite number where an action is not legal; the others (N,).
-    """
-    log_probs = logits.log_softmax(-1)
-    ratio = (log_probs.gather(1, actions[:, None]).squeeze(1) - old_log_probs).exp()
-    surrogate = torch.minimum(ratio * advantages, ratio.clamp(1 - clip, 1 + clip) * advantages)
-    return -surrogate, ratio, -(log_probs.exp() * log_probs).sum(-1)
+    def __init__(self, critic: nn.Module) -> None:
+        super().__init__()
+        self.critic = critic
+        self.in_keys: list[Any] = []
+        self.out_keys: list[Any] = ["state_value"]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the values."""
+        return tensordict.set("state_value", self.critic(seen_by_critic(tensordict))[:, None])
 
 
 class Ppo:
@@ -169,8 +155,20 @@ class Ppo:
             raise InvalidOptionError(
                 f"ppo: critic_warmup: there is no critic to learn alone, got {config.critic_warmup}"
             )
-        self.policy, self.critic, self.config = policy, critic, config
+        self.policy, self.config = policy, config
         self.modules: dict[str, nn.Module] = {"policy": policy} | ({"critic": critic} if critic is not None else {})
+        self.loss = ClipPPOLoss(
+            actor(Logits(policy)),
+            None if critic is None else Values(critic),
+            clip_epsilon=config.clip,
+            entropy_coeff=config.entropy,
+            critic_coeff=None if critic is None else VALUE_WEIGHT,
+            loss_critic_type="l2",
+            reduction="none",
+            functional=False,
+        )
+        self.loss.loss_mask_key = None  # turns that do not count never become samples
+        self.loss.set_keys(sample_log_prob=LOG_PROB)
         self.optimizer = torch.optim.Adam(
             [{"params": list(module.parameters())} for module in self.modules.values()], fused=True
         )
@@ -178,7 +176,7 @@ class Ppo:
     def update(self, samples: TensorDict, progress: float, rng: np.random.Generator) -> UpdateReport:
         """Several epochs of minibatches; `progress` in [0, 1] places learning rate and entropy bonus."""
         config = self.config
-        entropy_weight = between(config.entropy, config.final_entropy, progress)
+        self.loss.entropy_coeff.fill_(between(config.entropy, config.final_entropy, progress))
         rate = between(config.learning_rate, config.final_learning_rate, progress)
         of_policy = 0.0 if progress < config.critic_warmup else config.policy_rate
         for name, group in zip(self.modules, self.optimizer.param_groups, strict=True):
@@ -186,33 +184,23 @@ class Ppo:
         device = device_of(self.policy)
         samples = samples.to(device)
         reports = [
-            self._step(samples[indices.to(device)], entropy_weight)
+            self._step(samples[indices.to(device)])
             for indices in minibatches(samples.shape[0], config.minibatch, config.epochs, rng)
         ]
         return UpdateReport(*means(reports))
 
-    def _step(self, batch: TensorDict, entropy_weight: float) -> Tensor:
-        logits, share = self.policy(batch["observation"]), batch["weight"] / batch["weight"].sum()
-        losses, ratio, entropies = policy_loss(
-            logits, batch["target"], batch["log_prob"], batch["advantage"], self.config.clip
-        )
-        loss, entropy = share @ losses, share @ entropies
-        total = loss - entropy_weight * entropy
-        value_loss = torch.zeros_like(loss)
-        if self.critic is not None:
-            values = self.critic(batch.get("central", batch["observation"]))
-            value_loss = share @ (values - batch["value_target"]).square()
-            total = total + VALUE_WEIGHT * value_loss
+    def _step(self, batch: TensorDict) -> Tensor:
+        losses, share = self.loss(batch), batch["weight"] / batch["weight"].sum()
+        terms = {name: share @ losses[name] for name in losses.sorted_keys if name.startswith("loss_")}
         self.optimizer.zero_grad()
-        total.backward()
+        sum(terms.values()).backward()
         norms = [
             nn.utils.clip_grad_norm_(module.parameters(), self.config.max_grad_norm) for module in self.modules.values()
         ]
         self.optimizer.step()
-        with torch.no_grad():
-            kl = share @ ((ratio - 1) - ratio.log())
-            clipped = share @ ((ratio - 1).abs() > self.config.clip).float()
-            return torch.stack([loss, value_loss, entropy, kl, clipped, norms[0]])
+        loss, value_loss = (terms.get(name, torch.zeros_like(norms[0])) for name in ("loss_objective", "loss_critic"))
+        told = (losses[name] for name in ("entropy", "kl_approx", "clip_fraction"))
+        return torch.stack([loss.detach(), value_loss.detach() / VALUE_WEIGHT, *told, norms[0]])
 
 
 def means(reports: Sequence[Tensor]) -> list[float]:

@@ -25,7 +25,6 @@ from marl_sched.train.guard import exclusive, stopping
 from marl_sched.train.logging import RunLog
 from marl_sched.train.malloc import keep_freed_memory
 from marl_sched.train.parts import Parts, build
-from marl_sched.train.ppo import Sampler
 
 _SAMPLES = 2  # last word of the seeds that pick and order samples
 
@@ -83,7 +82,7 @@ def train(parts: Parts, counters: Counters, directory: Path, *, quiet: bool = Fa
         while counters.update < config.updates and not stop.requested:
             started = time.perf_counter()
             update = counters.update
-            rollout = parts.collector.collect(Sampler(parts.learner.policy), parts.length(update))
+            rollout = parts.collector.collect(parts.learner.policy, parts.length(update))
             rng = np.random.default_rng([config.seed, update, _SAMPLES])
             report = parts.learner.learn(rollout, update / config.updates, rng)
             counters.update += 1

@@ -8,6 +8,8 @@ of the problem graph (see marl_sched.graph), and
 
     action       (B,)    int64    an action
     acting       (B,)    int64    the agent whose turn it is, -1 where the episode is over
+    uniform      (B,)    float64  in [0, 1), with which a policy that samples picks for the acting agent; counter-based
+                                  (TurnSimulator.policy_noise)
     elapsed      (B,)    int64    simulated time that the last step let pass, the exponent of a semi-Markov discount
     conflict     (B,)    bool     the last choice was legal in its agent's view and impossible in truth
     illegal      (B,)    bool     the last choice was one that the mask forbade, so that its agent did nothing
@@ -118,6 +120,7 @@ class SchedulingTorchRL(SavesState, EnvBase):
         self.observation_spec = Composite(
             **arrays,
             acting=Bounded(-1, self.simulator.max_agents - 1, batch, dtype=torch.int64),
+            uniform=Bounded(0.0, 1.0, batch, dtype=torch.float64),
             elapsed=Unbounded(batch, dtype=torch.int64),
             conflict=Binary(shape=batch, dtype=torch.bool),
             illegal=Binary(shape=batch, dtype=torch.bool),
@@ -185,7 +188,7 @@ class SchedulingTorchRL(SavesState, EnvBase):
         self._illegal[rows] = False
         self._mask[rows] = self._scratch[ACTION_MASK][rows] != 0
         index = torch.from_numpy(np.flatnonzero(rows))
-        entries = self._books()
+        entries = self._turn_entries()
         for name, _, _ in self._layout:
             seen = tensordict.get(name).cpu().clone()  # the finished step keeps its own tensors
             seen[index] = torch.from_numpy(self._scratch[name])[index].to(seen.dtype)
@@ -230,12 +233,13 @@ class SchedulingTorchRL(SavesState, EnvBase):
         }
         simulator.observe(simulator.acting, arrays)
         np.copyto(self._mask, out[ACTION_MASK].numpy())
-        return out | self._books()
+        return out | self._turn_entries()
 
-    def _books(self) -> dict[str, torch.Tensor]:
-        """Who acts, what the last step let happen and who is done, in fresh tensors."""
+    def _turn_entries(self) -> dict[str, torch.Tensor]:
+        """Who acts and with which uniform, what the last step let happen and who is done, in fresh tensors."""
         simulator, out = self.simulator, {}
         out["acting"] = torch.from_numpy(simulator.acting.copy())
+        out["uniform"] = torch.from_numpy(simulator.policy_noise(simulator.acting))
         out["elapsed"] = torch.from_numpy(simulator.elapsed.copy())
         out["conflict"] = torch.from_numpy(simulator.conflict.copy())
         out["illegal"] = torch.from_numpy(self._illegal.copy())

@@ -29,7 +29,7 @@ def test_a_turn_within_a_decision_epoch_discounts_nothing_and_one_that_passes_ti
     # Two turns in one decision epoch, the second lets 2 units pass. gamma = 1/2, lambda = 1.
     # delta_1 = 3 + 0.25 * 8 - 1 = 4; delta_0 = 0 + 1 * 1 - 2 = -1; A_1 = 4; A_0 = -1 + 1 * 4 = 3.
     advantages, targets = generalised_advantages(
-        column(0, 3), column(0, 2), column(2, 1, 8), flags(1, 1, 1), flags(1, 1, 1), discount=0.5, gae_lambda=1.0
+        column(0, 3), column(0, 2), column(2, 1), column(1, 8), flags(0, 1), flags(0, 0), discount=0.5, gae_lambda=1.0
     )
     assert advantages[:, 0].tolist() == [3.0, 4.0]
     assert targets[:, 0].tolist() == [5.0, 5.0]
@@ -37,17 +37,17 @@ def test_a_turn_within_a_decision_epoch_discounts_nothing_and_one_that_passes_ti
 
 def test_the_trace_fades_with_simulated_time():
     # gamma = 1, lambda = 1/2, no values: A_2 = 8, A_1 = 4 + (1/2)^2 * 8 = 6, A_0 = 2 + (1/2)^0 * 6 = 8.
-    ones = flags(1, 1, 1, 1)
+    none, zeros = flags(0, 0, 0), column(0, 0, 0)
     advantages, _ = generalised_advantages(
-        column(2, 4, 8), column(0, 2, 1), column(0, 0, 0, 0), ones, ones, discount=1.0, gae_lambda=0.5
+        column(2, 4, 8), column(0, 2, 1), zeros, zeros, flags(0, 0, 1), none, discount=1.0, gae_lambda=0.5
     )
     assert advantages[:, 0].tolist() == [8.0, 6.0, 8.0]
 
 
 def test_an_end_is_worth_nothing_and_a_cut_is_worth_its_value():
-    rewards, elapsed, values, valid = column(1, 1), column(1, 1), column(0, 0, 100), flags(1, 1, 0)
-    ended, _ = generalised_advantages(rewards, elapsed, values, valid, flags(1, 1, 0), discount=0.5, gae_lambda=0.0)
-    cut, _ = generalised_advantages(rewards, elapsed, values, valid, flags(1, 1, 1), discount=0.5, gae_lambda=0.0)
+    turns = (column(1, 1), column(1, 1), column(0, 0), column(0, 100), flags(0, 1))
+    ended, _ = generalised_advantages(*turns, flags(0, 1), discount=0.5, gae_lambda=0.0)
+    cut, _ = generalised_advantages(*turns, flags(0, 0), discount=0.5, gae_lambda=0.0)
     assert ended[:, 0].tolist() == [1.0, 1.0]
     assert cut[:, 0].tolist() == [1.0, 51.0]
 
@@ -63,8 +63,8 @@ def test_an_own_turn_lasts_until_the_agents_next_one_and_earns_what_the_team_doe
     # Agent 1, turn 3 is its last: not learned from. Turn 1: earns 2 + 4/2 = 4 in 3 hours, target 4 + 16/8 = 6,
     #          advantage 6 - 5 = 1; nothing flows back from turn 3 but its value.
     advantages, targets, loss_mask = own_turn_advantages(
-        column(0, 2, 4, 8), column(0, 1, 2, 1), column(1, 5, 3, 16, 40),
-        torch.tensor([[0], [1], [0], [1], [0]]), flags(1, 1, 1, 1, 1), flags(1, 1, 1, 1, 1),
+        column(0, 2, 4, 8), column(0, 1, 2, 1), column(1, 5, 3, 16), column(5, 3, 16, 40),
+        torch.tensor([[0], [1], [0], [1]]), torch.tensor([[1], [0], [1], [0]]), flags(0, 0, 0, 1), flags(0, 0, 0, 0),
         discount=0.5, gae_lambda=0.5,
     )  # fmt: skip
     assert loss_mask[:, 0].tolist() == [True, True, True, False]
@@ -73,89 +73,99 @@ def test_an_own_turn_lasts_until_the_agents_next_one_and_earns_what_the_team_doe
 
 
 def test_no_own_turn_is_lost_where_an_episode_ends_and_none_reaches_over_its_cut():
-    # Turn 2 of row 0 is an end, of row 1 a cut at which agent 1 was to act. After it another episode begins. gamma 1.
+    # Turn 1 of row 0 is an end, of row 1 a cut at which agent 1 was to act. After it another episode begins. gamma 1.
     # Row 0: both turns run to the end. Agent 0 earns 1 + 2, agent 1 earns 2.
     # Row 1: agent 1 has the value of the cut, 2 + 7; agent 0 has no future that is known.
-    agents = torch.tensor([[0, 0], [1, 1], [-1, 1], [0, 1], [0, 0]])
-    valid = torch.tensor([[1, 1], [1, 1], [0, 0], [1, 1], [1, 1]]).bool()
-    alive = torch.tensor([[1, 1], [1, 1], [0, 1], [1, 1], [1, 1]]).bool()
-    rewards = torch.tensor([[1.0, 1.0], [2.0, 2.0], [NAN, NAN], [100.0, 100.0]])
-    values = torch.tensor([[0.0, 0.0], [0.0, 0.0], [NAN, 7.0], [0.0, 0.0], [1000.0, 1000.0]])
+    agents = torch.tensor([[0, 0], [1, 1], [0, 1]])
+    next_agents = torch.tensor([[1, 1], [-1, 1], [0, 0]])
+    boundary = torch.tensor([[0, 0], [1, 1], [1, 1]]).bool()
+    terminated = torch.tensor([[0, 0], [1, 0], [0, 0]]).bool()
+    rewards = torch.tensor([[1.0, 1.0], [2.0, 2.0], [100.0, 100.0]])
+    values, next_values = torch.zeros(3, 2), torch.tensor([[0.0, 0.0], [NAN, 7.0], [1000.0, 1000.0]])
     advantages, _, loss_mask = own_turn_advantages(
-        rewards, torch.ones(4, 2, dtype=torch.int64), values, agents, valid, alive, discount=1.0, gae_lambda=1.0
-    )
-    assert loss_mask.T.tolist() == [[True, True, False, True], [False, True, False, False]]
-    assert advantages.T.tolist() == [[3.0, 2.0, 0.0, 1100.0], [0.0, 9.0, 0.0, 0.0]]
+        rewards, torch.ones(3, 2, dtype=torch.int64), values, next_values, agents, next_agents, boundary, terminated,
+        discount=1.0, gae_lambda=1.0,
+    )  # fmt: skip
+    assert loss_mask.T.tolist() == [[True, True, True], [False, True, False]]
+    assert advantages.T.tolist() == [[3.0, 2.0, 1100.0], [0.0, 9.0, 0.0]]
+
+
+def drawn(seed: int, agents: int) -> dict[str, torch.Tensor]:
+    """Random turns (30, 5) with ends and cuts; values without a future are NaN."""
+    rng = np.random.default_rng(seed)
+    shape = (30, 5)
+    boundary = rng.random(shape) < 0.15
+    boundary[-1] = True
+    terminated = boundary & (rng.random(shape) < 0.4)
+    who, heir = rng.integers(0, agents, shape), rng.integers(0, agents, shape)
+    heir[:-1] = np.where(boundary[:-1], heir[:-1], who[1:])
+    values, following = rng.normal(size=shape), rng.normal(size=shape)
+    following[:-1] = np.where(boundary[:-1], following[:-1], values[1:])
+    found = {
+        "rewards": rng.normal(size=shape),
+        "elapsed": rng.integers(0, 4, shape),
+        "values": values,
+        "next_values": np.where(terminated, NAN, following),
+        "agents": who,
+        "next_agents": np.where(terminated, -1, heir),
+        "boundary": boundary,
+        "terminated": terminated,
+    }
+    return {name: torch.from_numpy(array) for name, array in found.items()}
 
 
 def test_one_agents_own_turns_are_the_teams():
-    rng = np.random.default_rng(4)
-    rewards, values = torch.from_numpy(rng.normal(size=(20, 6))), torch.from_numpy(rng.normal(size=(21, 6)))
-    elapsed = torch.from_numpy(rng.integers(0, 4, (20, 6)))
-    alive = torch.from_numpy(rng.random((21, 6)) < 0.9)
-    valid = alive & torch.from_numpy(rng.random((21, 6)) < 0.8)
-    factors = {"discount": 0.9, "gae_lambda": 0.7}
-    team = generalised_advantages(rewards, elapsed, values, valid, alive, **factors)
-    own = own_turn_advantages(rewards, elapsed, values, torch.zeros_like(valid).long(), valid, alive, **factors)
-    assert own[2].equal(valid[:-1])
+    turns, factors = drawn(4, 1), {"discount": 0.9, "gae_lambda": 0.7}
+    own = own_turn_advantages(**turns, **factors)
+    team = generalised_advantages(
+        **{name: value for name, value in turns.items() if not name.endswith("agents")}, **factors
+    )
+    assert own[2].all()
     torch.testing.assert_close(own[:2], team)
 
 
 @pytest.mark.parametrize("seed", range(20))
 def test_own_turns_agree_with_a_plain_walk_from_turn_to_turn(seed: int):
-    rng = np.random.default_rng(seed)
-    turns, rows, discount, gae_lambda = 30, 5, 0.9, 0.8
-    alive = rng.random((turns + 1, rows)) < 0.93
-    valid = alive & (rng.random((turns + 1, rows)) < 0.93)
-    agents = np.where(alive, rng.integers(0, 1 + seed % 4, alive.shape), -1)
-    rewards, elapsed = rng.normal(size=(turns, rows)), rng.integers(0, 4, (turns, rows))
-    values = rng.normal(size=(turns + 1, rows))
-    expected, loss_mask = np.zeros((2, turns, rows)), np.zeros((turns, rows), bool)
-    for t, row in reversed(np.argwhere(valid[:-1]).tolist()):
-        earned, passed, later = 0.0, 0, t
+    turns, discount, gae_lambda = drawn(seed, 1 + seed % 4), 0.9, 0.8
+    rewards, elapsed, values, following, who, heir, boundary, terminated = (v.numpy() for v in turns.values())
+    expected, loss_mask = np.zeros((2, *rewards.shape)), np.zeros(rewards.shape, bool)
+    for t, row in reversed(list(np.ndindex(rewards.shape))):
+        earned, passed, later, future, credit, known = 0.0, 0, t, 0.0, 0.0, False
         while True:
             earned += discount**passed * rewards[later, row]
-            passed, later = passed + elapsed[later, row], later + 1
-            over = later == turns or not valid[later, row]
-            if over or agents[later, row] == agents[t, row]:
+            passed += elapsed[later, row]
+            if boundary[later, row]:
+                mine = heir[later, row] == who[t, row]
+                known = mine or terminated[later, row]
+                future = following[later, row] if mine else 0.0
                 break
-        mine = agents[later, row] == agents[t, row]
-        future = values[later, row] if alive[later, row] else 0.0
-        credit = 0.0 if over else gae_lambda**passed * expected[0, later, row]
-        loss_mask[t, row] = mine or not alive[later, row]
-        if loss_mask[t, row]:
+            later += 1
+            if who[later, row] == who[t, row]:
+                known, future, credit = True, values[later, row], gae_lambda**passed * expected[0, later, row]
+                break
+        loss_mask[t, row] = known
+        if known:
             target = earned + discount**passed * (future + credit)
             expected[:, t, row] = target - values[t, row], target
-    found = own_turn_advantages(
-        torch.from_numpy(np.where(valid[:-1], rewards, NAN)),
-        torch.from_numpy(elapsed),
-        torch.from_numpy(np.where(alive, values, NAN)),
-        torch.from_numpy(agents),
-        torch.from_numpy(valid),
-        torch.from_numpy(alive),
-        discount=discount,
-        gae_lambda=gae_lambda,
-    )
+    found = own_turn_advantages(**turns, discount=discount, gae_lambda=gae_lambda)
     assert found[2].numpy().tolist() == loss_mask.tolist()
     np.testing.assert_allclose(np.stack([found[0], found[1]]), expected, atol=1e-12)
 
 
 def test_nothing_reaches_over_a_cut_into_the_next_episode():
-    # Turn 1 is a cut: its state counts as turn 0's future, what the next episode brings does not.
+    # Turn 0 is cut: its target is 1 + 6/2 whatever the next episode brings.
     advantages, _ = generalised_advantages(
-        column(1, NAN, 1000), column(1, 1, 1), column(0, 6, 0, 0), flags(1, 0, 1, 1), flags(1, 1, 1, 1),
+        column(1, 1000), column(1, 1), column(0, 0), column(6, 0), flags(1, 1), flags(0, 0),
         discount=0.5, gae_lambda=1.0,
     )  # fmt: skip
-    assert advantages[:, 0].tolist() == [4.0, 0.0, 1000.0]
+    assert advantages[:, 0].tolist() == [4.0, 1000.0]
 
 
-def test_masked_turns_may_hold_nan():
-    valid, alive = flags(1, 0, 0), flags(1, 0, 0)
+def test_the_value_of_what_an_end_led_to_may_be_nan():
     advantages, targets = generalised_advantages(
-        column(2, NAN), column(1, NAN), column(0, NAN, NAN), valid, alive, discount=0.9, gae_lambda=0.9
+        column(2), column(1), column(0), column(NAN), flags(1), flags(1), discount=0.9, gae_lambda=0.9
     )
-    assert advantages[:, 0].tolist() == [2.0, 0.0]
-    assert targets[:, 0].tolist() == [2.0, 0.0]
+    assert advantages[:, 0].tolist() == targets[:, 0].tolist() == [2.0]
 
 
 def test_rewards_to_go_spread_a_turn_over_the_time_it_lets_pass():

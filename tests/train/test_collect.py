@@ -5,99 +5,154 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
+from torchrl.envs import check_env_specs
 
+from marl_sched.agents.networks.hetgat.network import HetGATNetwork
 from marl_sched.domain import get_domain
-from marl_sched.envs.airme.views import LocalView
-from marl_sched.envs.api.torchrl_env import SchedulingTorchRL
-from marl_sched.train.collect import EpisodeCollector, InstanceSource, Rollout, SegmentCollector
+from marl_sched.errors import InvalidOptionError
+from marl_sched.train.collect import EpisodeCollector, Rollout, SegmentCollector, WorkerCollector, segment_collector
+from marl_sched.train.environment import InstanceSource
+from tests.train.playing import task
 
 
-def environment(rows: int = 4, episodes: int = 1, horizon: int = 100) -> SchedulingTorchRL:
-    source = InstanceSource(get_domain("airme"), ["small"], seed=3, rows=rows, episodes=episodes)
-    return SchedulingTorchRL("airme", batch_size=rows, source=source, view=LocalView(), horizon=horizon, seed=3)
-
-
-def pick(observation: dict[str, torch.Tensor], uniform: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
-    """Any legal action, all alike."""
-    legal = observation["action_mask"].numpy() > 0
-    rank = np.floor(uniform * legal.sum(axis=1))
-    actions = (legal.cumsum(axis=1) > rank[:, None]).argmax(axis=1)
-    return torch.from_numpy(actions), torch.from_numpy(-np.log(legal.sum(axis=1)).astype(np.float32))
+@pytest.fixture(scope="module")
+def policy() -> HetGATNetwork:
+    torch.manual_seed(0)
+    return HetGATNetwork(task().environment(0, 1).simulator.graph, width=2, heads=2, layers=1)
 
 
 def same(a: Rollout, b: Rollout) -> bool:
-    columns = ("actions", "log_probs", "rewards", "elapsed", "times", "valid", "alive")
-    views = (("observation", name) for name in a.observation)
-    centrals = (("central", name) for name in a.central)
-    return all(torch.equal(getattr(a, name), getattr(b, name)) for name in columns) and all(
-        torch.equal(getattr(a, view)[name], getattr(b, view)[name]) for view, name in (*views, *centrals)
-    )
+    entries = set(a.data.keys(True, True))
+    assert entries == set(b.data.keys(True, True))
+    return all(torch.equal(a.data[name], b.data[name]) for name in entries)
 
 
-def test_whole_episodes_are_cut_at_the_length_in_every_row():
-    rollout = EpisodeCollector(environment(), central=False).collect(pick, 20)
+def test_the_training_environment_keeps_its_specs():
+    check_env_specs(task(rows=2, central=True, memory=(3, 2)).environment())
+
+
+def test_whole_episodes_are_cut_at_the_length_in_every_row(policy: HetGATNetwork):
+    rollout = EpisodeCollector(task(turns=None, length=20)).collect(policy, 20)
     valid = rollout.valid
-    assert not valid[-1].any()
     assert (rollout.times[valid] < 20).all()
+    assert ((rollout.times + rollout.elapsed)[valid & rollout.boundary] >= 20).all()
     assert len(set(valid.sum(0).tolist())) > 1, "rows end at different decision counts"
     assert (valid[1:] <= valid[:-1]).all(), "a row does not come back"
+    assert ((valid & rollout.boundary).sum(0) == 1).all()
 
 
-def test_rows_that_share_an_instance_stand_side_by_side_and_differ_in_noise():
-    collector = EpisodeCollector(environment(rows=6, episodes=3), central=False)
-    rollout = collector.collect(pick, 20)
+def test_rows_that_share_an_instance_stand_side_by_side_and_differ_in_noise(policy: HetGATNetwork):
+    collector = EpisodeCollector(task(rows=6, episodes=3, turns=None))
+    rollout = collector.collect(policy, 20)
     identities = [instance.identity for instance in collector.env.simulator.instances]
     assert identities[0] == identities[1] == identities[2] != identities[3] == identities[4] == identities[5]
     assert not torch.equal(rollout.rewards[:, 0], rollout.rewards[:, 1])
-    collector.collect(pick, 20)
+    collector.collect(policy, 20)
     assert collector.env.simulator.instances[0].identity not in identities
 
 
-def test_a_segment_goes_on_where_the_last_one_stopped():
-    collector = SegmentCollector(environment(), turns=16, length=1000, central=True)
-    collector._cut[:] = 1000
-    first, second = collector.collect(pick, 1000), collector.collect(pick, 1000)
-    assert torch.equal(first.times[-1], second.times[0])
-    assert torch.equal(first.observation["plane"][-1], second.observation["plane"][0])
+def test_a_segment_goes_on_where_the_last_one_stopped(policy: HetGATNetwork):
+    collector = SegmentCollector(task(turns=8, length=4000))
+    first, second = collector.collect(policy, 4000), collector.collect(policy, 4000)
+    assert torch.equal(first.data["next", "plane"][:, -1], second.data["plane"][:, 0])
+    assert torch.equal(first.data["next", "time"][:, -1], second.data["time"][:, 0])
     assert first.valid.all()
+    assert first.boundary[-1].all()
+    assert not first.boundary[:-1].any()
 
 
-def test_a_row_at_its_length_is_observed_once_more_and_begins_a_new_instance():
-    collector = SegmentCollector(environment(), turns=60, length=8, central=True)
-    before = [instance.identity for instance in collector.env.simulator.instances]
-    rollout = collector.collect(pick, 8)
+def test_a_row_at_its_length_is_cut_with_a_future_and_begins_a_new_instance(policy: HetGATNetwork):
+    collector = SegmentCollector(task(turns=60))
+    rollout = collector.collect(policy, 8)
+    first = [InstanceSource(get_domain("airme"), ["small"], seed=3, rows=4)(row, 0).identity for row in range(4)]
     for row in range(4):
-        cuts = (~rollout.valid[:, row]).nonzero().squeeze(1)
+        cuts = rollout.boundary[:, row].nonzero().squeeze(1)
         assert len(cuts) > 1
-        for cut in cuts[:-1].tolist():
-            assert rollout.alive[cut, row]
-            assert rollout.times[cut, row] >= (8 if cut > cuts[0] else 1)
+        for number, cut in enumerate(cuts[:-1].tolist()):
+            assert not rollout.terminated[cut, row]
+            staggered = 8 * (row + 1) // 4
+            assert rollout.data["next", "time"][row, cut] >= (8 if number else staggered)
+            assert rollout.times[cut, row] < 8
             assert rollout.times[cut + 1, row] == 0
-    assert not set(before) & {instance.identity for instance in collector.env.simulator.instances}
+    assert not set(first) & {instance.identity for instance in collector.env.simulator.instances}
 
 
-def test_an_end_of_the_environment_is_no_future():
-    collector = SegmentCollector(environment(horizon=5), turns=40, length=50, central=False)
-    rollout = collector.collect(pick, 50)
-    ended = ~rollout.alive
-    assert ended.any()
-    assert (rollout.times[ended] == 5).all()
-    assert not (rollout.valid & ended).any()
+def test_choices_are_those_of_the_uniforms_in_the_tensordict(policy: HetGATNetwork):
+    rollout = SegmentCollector(task(turns=10)).collect(policy, 8)
+    names = [
+        name for name in rollout.data.sorted_keys if not isinstance(rollout.data[name], type(rollout.data["next"]))
+    ]
+    states = rollout.data.select(*names).flatten(0, 1)
+    with torch.no_grad():
+        probs = policy(states).softmax(-1).double()
+    below = torch.cat([torch.zeros(len(probs), 1, dtype=torch.float64), probs.cumsum(1)], 1)
+    low, high = (below.gather(1, states["action"][:, None] + k).squeeze(1) for k in (0, 1))
+    assert (low - 1e-5 <= states["uniform"]).all()
+    assert (states["uniform"] <= high + 1e-5).all()
 
 
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: SegmentCollector(environment(), turns=24, length=12, central=True),
-        lambda: EpisodeCollector(environment(rows=4, episodes=2), central=False),
+        lambda: SegmentCollector(task(turns=24, length=12, central=True)),
+        lambda: EpisodeCollector(task(turns=None, episodes=2, length=12)),
     ],
+    ids=["segments", "episodes"],
 )
-def test_a_restored_collector_goes_on_exactly(make: Callable[[], SegmentCollector | EpisodeCollector]):
+def test_a_restored_collector_goes_on_exactly(
+    make: Callable[[], SegmentCollector | EpisodeCollector], policy: HetGATNetwork
+):
     collector, other = make(), make()
     for _ in range(3):
-        collector.collect(pick, 12)
+        collector.collect(policy, 12)
     other.restore(collector.state())
-    assert same(collector.collect(pick, 12), other.collect(pick, 12))
+    assert same(collector.collect(policy, 12), other.collect(policy, 12))
+
+
+def test_a_collector_that_was_saved_before_it_began_begins(policy: HetGATNetwork):
+    collector, other = (SegmentCollector(task(turns=6)) for _ in range(2))
+    other.restore(collector.state())
+    assert same(collector.collect(policy, 8), other.collect(policy, 8))
+
+
+@pytest.mark.slow
+def test_workers_play_as_one_process_does(policy: HetGATNetwork):
+    alone, workers = segment_collector(task(turns=12), "sync", 1), segment_collector(task(turns=12), "multi", 2)
+    try:
+        for _ in range(2):
+            expected, found = alone.collect(policy, 8), workers.collect(policy, 8)
+            for name in ("actions", "rewards", "times", "boundary"):
+                assert torch.equal(getattr(expected, name), getattr(found, name)), name
+    finally:
+        workers.close()
+
+
+@pytest.mark.slow
+def test_ray_workers_play_as_one_process_does(policy: HetGATNetwork):
+    pytest.importorskip("ray", reason="the extra `cluster` is not installed")
+    alone, workers = segment_collector(task(turns=12), "sync", 1), segment_collector(task(turns=12), "ray", 2)
+    try:
+        expected, found = alone.collect(policy, 8), workers.collect(policy, 8)
+        for name in ("actions", "rewards", "times", "boundary"):
+            assert torch.equal(getattr(expected, name), getattr(found, name)), name
+    finally:
+        workers.close()
+
+
+def test_a_resumed_run_with_workers_plays_no_episode_twice():
+    collector = WorkerCollector(task(turns=5), 2)
+    collector._updates = 3
+    other = WorkerCollector(task(turns=5), 2)
+    other.restore(collector.state())
+    env = other._factories()[1]()
+    env.reset()
+    source = InstanceSource(get_domain("airme"), ["small"], seed=3, rows=4)
+    assert env.simulator.instances[0].identity == source(2, 15).identity
+
+
+def test_workers_share_rows_evenly():
+    with pytest.raises(InvalidOptionError, match=r"workers: expected a divisor of the 4 rows.*got 3"):
+        segment_collector(task(), "multi", 3)
 
 
 def test_instances_of_a_run_are_those_of_no_evaluation_with_the_same_seed():
@@ -112,3 +167,11 @@ def test_scales_take_turns():
     source = InstanceSource(get_domain("airme"), ["small", "large"], seed=0, rows=4)
     sizes = [source(row, 0).n_planes for row in range(4)]
     assert [size > 40 for size in sizes] == [False, True, False, True]
+
+
+def test_rows_play_the_same_in_whatever_part_of_the_run_they_are(policy: HetGATNetwork):
+    whole, part = task(turns=None).environment(), task(turns=None).environment(2, 2)
+    whole.reset(), part.reset()
+    identities = [instance.identity for instance in whole.simulator.instances]
+    assert identities[2:] == [instance.identity for instance in part.simulator.instances]
+    assert np.array_equal(whole.simulator.episode_keys[2:], part.simulator.episode_keys)

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from dataclasses import replace
-
 import msgspec
 import numpy as np
 import pytest
@@ -10,17 +8,16 @@ import torch
 from marl_sched.agents.base import AdvantageScheduler
 from marl_sched.agents.networks.hetgat.network import HetGATNetwork
 from marl_sched.agents.policies.cards import read_card
-from marl_sched.domain import get_domain
-from marl_sched.envs.airme.views import LocalView
 from marl_sched.envs.api.torchrl_env import SchedulingTorchRL
 from marl_sched.errors import InvalidOptionError
 from marl_sched.train.algorithms.imitation import Imitation, ImitationConfig, cross_entropy, expected_advantage
-from marl_sched.train.collect import InstanceSource, Rollout, SegmentCollector
-from marl_sched.train.ppo import Sampler
+from marl_sched.train.collect import Rollout
 from marl_sched.train.run import train_from_overrides
+from tests.train.playing import LOCAL, segment
 
 CONFIG = ImitationConfig(
-    instances=6, turns=20, teacher="none", epochs=1, minibatch=64, learning_rate=1e-2, final_learning_rate=1e-2,
+    instances=6, turns=20, teacher="none", criterion="cross_entropy", epochs=1, minibatch=64,
+    learning_rate=1e-2, final_learning_rate=1e-2,
     temperature=0.1, final_temperature=0.1, max_grad_norm=1.0, min_keep_prob=1.0,
 )  # fmt: skip
 
@@ -40,10 +37,7 @@ class Oldest(AdvantageScheduler):
 
 
 def rollout(policy: HetGATNetwork, *, staleness: int = 0, turns: int = 20) -> Rollout:
-    source = InstanceSource(get_domain("airme"), ["small"], seed=3, rows=6)
-    view = LocalView(staleness=staleness)
-    env = SchedulingTorchRL("airme", batch_size=6, source=source, view=view, horizon=100, seed=3)
-    return SegmentCollector(env, turns=turns, length=40, central=True).collect(Sampler(policy), 40)
+    return segment(policy, rows=6, length=40, turns=turns, view={**LOCAL, "staleness": staleness})
 
 
 @pytest.fixture
@@ -103,31 +97,9 @@ def test_the_teacher_is_asked_about_the_true_state(policy: HetGATNetwork) -> Non
 
     played = rollout(policy, staleness=12)
     Imitation(policy, Listening(), CONFIG).learn(played, 0.0, np.random.default_rng(0))
-    valid = played.valid[:-1].flatten()
-    np.testing.assert_array_equal(asked[0]["plane"], played.central["plane"][:20].flatten(0, 1)[valid].numpy())
-    assert not np.array_equal(asked[0]["plane"], played.observation["plane"][:20].flatten(0, 1)[valid].numpy())
-
-
-def test_what_turns_that_are_not_valid_hold_does_not_matter(policy: HetGATNetwork) -> None:
-    state = {name: value.clone() for name, value in policy.state_dict().items()}
-    clean = rollout(policy, turns=60)
-    gone = ~clean.valid
-    assert gone[:-1].any()
-    spoilt = {
-        name: torch.where(gone.view(*gone.shape, *[1] * (v.dim() - 2)), torch.nan, v) if v.is_floating_point() else v
-        for name, v in clean.observation.items()
-    }
-    learned = []
-    for played in (
-        clean,
-        replace(clean, observation=spoilt, log_probs=clean.log_probs.masked_fill(gone[:-1], torch.nan)),
-    ):
-        policy.load_state_dict(state)
-        Imitation(policy, Oldest(), CONFIG).learn(played, 0.0, np.random.default_rng(0))
-        learned.append([parameter.detach().clone() for parameter in policy.parameters()])
-    for a, b in zip(*learned, strict=True):
-        assert torch.isfinite(a).all()
-        assert torch.equal(a, b)
+    in_turn = played.data.transpose(0, 1).flatten(0, 1)
+    np.testing.assert_array_equal(asked[0]["plane"], in_turn["central", "plane"].numpy())
+    assert not np.array_equal(asked[0]["plane"], in_turn["plane"].numpy())
 
 
 TINY = [

@@ -14,17 +14,16 @@ from marl_sched.agents.networks.deeprm import DeepRMNetwork
 from marl_sched.agents.networks.network import slots_of
 from marl_sched.agents.policies.cards import read_card
 from marl_sched.cli.app import run as run_command
-from marl_sched.domain import get_domain
-from marl_sched.envs.api.torchrl_env import SchedulingTorchRL
 from marl_sched.files import read_json, write_json
 from marl_sched.problem import Problem
 from marl_sched.train.algorithms.step_baseline import StepBaseline
-from marl_sched.train.collect import EpisodeCollector, InstanceSource
+from marl_sched.train.collect import EpisodeCollector
 from marl_sched.train.config import load_config
 from marl_sched.train.evaluation.evaluate import evaluate_scheduler
 from marl_sched.train.learner import PolicyGradient
-from marl_sched.train.ppo import Ppo, Sampler
+from marl_sched.train.ppo import Ppo
 from marl_sched.train.run import resume, train_from_overrides
+from tests.train.playing import task
 
 TINY = [
     "algorithm=reinforce", "policy.hidden=4", "algorithm.instances=2", "algorithm.episodes=2", "updates=2",
@@ -35,22 +34,18 @@ EPISODES = 4
 LENGTH = 12
 
 
-def environment() -> SchedulingTorchRL:
-    source = InstanceSource(get_domain("airme"), ["small"], seed=3, rows=8, episodes=EPISODES)
-    return SchedulingTorchRL("airme", batch_size=8, source=source, horizon=100, seed=3)
-
-
 @pytest.mark.parametrize("architecture", ["decima", "deeprm"])
 def test_an_update_is_a_step_along_the_gradient_of_reinforce(architecture: str):
     """Against autograd of mean(A log pi), with A from rewards-to-go less their mean, all in plain loops."""
-    env = environment()
+    collector = EpisodeCollector(task(rows=8, episodes=EPISODES, turns=None, view={"kind": "full"}))
+    env = collector.env
     spec = env.simulator.graph
     torch.manual_seed(0)
     if architecture == "decima":
         network = DecimaNetwork(spec, hidden=8)
     else:
         network = DeepRMNetwork(spec, slots=slots_of(spec, env.simulator.arrays), hidden=8)
-    rollout = EpisodeCollector(env, central=False).collect(Sampler(network), LENGTH)
+    rollout = collector.collect(network, LENGTH)
     config = load_config(["algorithm=reinforce", "algorithm.ppo.max_grad_norm=1e9"]).algorithm.ppo
     expected = torch.autograd.grad(plain_loss(network, rollout), list(network.parameters()))
     before = [parameter.detach().clone() for parameter in network.parameters()]
@@ -86,7 +81,7 @@ def plain_loss(network: torch.nn.Module, rollout) -> torch.Tensor:
     advantages = (np.array(advantages) - np.mean(advantages)) / np.std(advantages)
     total = torch.zeros(())
     for (t, b), advantage in zip(taken, advantages, strict=True):
-        seen = {name: values[t, b : b + 1] for name, values in rollout.observation.items()}
+        seen = rollout.data[b : b + 1, t]
         total = total - float(advantage) * network(seen).log_softmax(-1)[0, rollout.actions[t, b]]
     return total / len(taken)
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -11,12 +9,12 @@ from torch import Tensor, nn
 
 from marl_sched.agents.networks.hetgat.network import HetGATNetwork
 from marl_sched.domain import get_domain
-from marl_sched.envs.api.torchrl_env import SchedulingTorchRL
 from marl_sched.train.algorithms.state_value import TIME_LEFT, StateValue, StateValueBaseline, TimedEpisodes
-from marl_sched.train.collect import InstanceSource, Rollout
+from marl_sched.train.collect import Rollout
 from marl_sched.train.config import RunRecord, load_config
 from marl_sched.train.export import knowledge
-from marl_sched.train.ppo import Sampler, samples_of
+from marl_sched.train.ppo import samples_of
+from tests.train.playing import changed, task
 
 LENGTH = 20
 
@@ -29,9 +27,8 @@ def policy() -> HetGATNetwork:
 
 @pytest.fixture(scope="module")
 def rollout(policy: HetGATNetwork) -> Rollout:
-    source = InstanceSource(get_domain("airme"), ["small"], seed=3, rows=4, episodes=2)
-    env = SchedulingTorchRL("airme", batch_size=4, source=source, horizon=100, seed=3, scheme="single")
-    return TimedEpisodes(env, central=False).collect(Sampler(policy), LENGTH)
+    playing = task(rows=4, episodes=2, turns=None, view={"kind": "full"}, options={"scheme": "single"})
+    return TimedEpisodes(playing).collect(policy, LENGTH)
 
 
 class Hourly(nn.Module):
@@ -55,17 +52,16 @@ def test_advantages_are_what_an_episode_still_earns_less_the_critics_value(rollo
             assert estimate.value_targets[t, row] == pytest.approx(earned)
             expected = earned - (LENGTH - int(rollout.times[t, row])) / 2
             assert estimate.advantages[t, row] == pytest.approx(expected)
-    assert estimate.loss_mask.equal(rollout.valid[:-1])
+    assert estimate.loss_mask.equal(rollout.valid)
 
 
 def test_turns_that_do_not_count_touch_nothing(rollout: Rollout, policy: HetGATNetwork):
-    assert (~rollout.valid[:-1]).any()
-    rewards = torch.where(rollout.valid[:-1], rollout.rewards, torch.nan)
+    assert (~rollout.valid).any()
     clean, dirty = (
         samples_of(
             policy, played, StateValueBaseline(Hourly(), discount=0.9).estimate(played), 1.0, np.random.default_rng(0)
         )
-        for played in (rollout, replace(rollout, rewards=rewards))
+        for played in (rollout, changed(rollout, ~rollout.valid, torch.nan, ("next", "reward")))
     )
     for name in ("advantage", "value_target"):
         assert torch.isfinite(clean[name]).all()
@@ -78,7 +74,7 @@ def test_critic_reads_the_time_left_and_the_state_node_but_sums_no_nodes(rollout
     assert not critic.critic.node_terms
     for parameter in critic.parameters():
         nn.init.normal_(parameter)
-    seen = {name: values[0] for name, values in rollout.central.items()}
+    seen = rollout.data[:, 0].to_dict()
     before = critic(seen)
     assert not torch.allclose(critic({**seen, TIME_LEFT: seen[TIME_LEFT] - 5}), before)
     assert not torch.allclose(critic({**seen, "state": seen["state"] + 1}), before)

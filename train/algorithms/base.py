@@ -19,12 +19,12 @@ import msgspec
 
 from marl_sched.agents.networks.hetgat.network import HetGATConfig, HetGATCritic
 from marl_sched.agents.networks.network import PolicyNetwork, slots_of
-from marl_sched.domain import get_domain
 from marl_sched.envs.api.torchrl_env import SchedulingTorchRL
-from marl_sched.errors import UnknownNameError
-from marl_sched.train.collect import Collector, InstanceSource, SegmentCollector
+from marl_sched.errors import InvalidOptionError, UnknownNameError
+from marl_sched.train.collect import Collector, SegmentCollector, segment_collector
 from marl_sched.train.curriculum import EpisodeLength
 from marl_sched.train.device import pick_device
+from marl_sched.train.environment import TrainingTask
 from marl_sched.train.learner import Learner
 
 if TYPE_CHECKING:
@@ -51,25 +51,36 @@ class Setup:
         """Whether agents see less than everything, so that the full graph is recorded beside their own."""
         return bool(self.config.make_view().hides)
 
-    def environment(self, *, rows: int, episodes: int = 1) -> SchedulingTorchRL:
-        """`rows` training episodes at once, each instance played `episodes` times."""
-        config = self.config
-        domain, scales = get_domain(config.env.name), config.env.scales
-        return SchedulingTorchRL(
-            domain,
-            batch_size=rows,
-            scale=max(scales, key=list(domain.scales).index),
-            source=InstanceSource(domain, scales, seed=config.seed, rows=rows, episodes=episodes),
-            view=config.make_view(),
-            objective=config.env.objective,
-            horizon=2 * self.length.longest,  # cuts come before the end, so that a state at a cut still has a value
-            seed=config.seed,
-            **config.env.options,
-        )
+    def whole_episodes(self, *, rows: int, episodes: int) -> TrainingTask:
+        """`rows` episodes at once, each instance played `episodes` times, as wholes.
+
+        Raises InvalidOptionError for a collector other than sync: the rows of an instance are played in lock-step to
+        their ends, and TorchRL's workers play a number of turns that is fixed before.
+        """
+        if self.config.collector.name != "sync":
+            raise InvalidOptionError(
+                f"train: collector: {self.config.algorithm.algorithm_name()} plays whole episodes: expected sync, "
+                f"got {self.config.collector.name}"
+            )
+        return self._task(rows=rows, episodes=episodes)
 
     def segments(self, *, rows: int, turns: int, central: bool) -> SegmentCollector:
         """A collector of `turns` turns of every row for each update."""
-        return SegmentCollector(self.environment(rows=rows), turns=turns, length=self.length(0), central=central)
+        task = self._task(rows=rows, turns=turns, central=central)
+        return segment_collector(task, self.config.collector.name, self.config.collector.workers)
+
+    def _task(self, **options: Any) -> TrainingTask:
+        config = self.config
+        return TrainingTask(
+            domain=config.env.name,
+            scales=config.env.scales,
+            objective=config.env.objective,
+            view=config.view,
+            options=config.env.options,
+            seed=config.seed,
+            length=self.length,
+            **options,
+        )
 
     def policy(self, env: SchedulingTorchRL) -> PolicyNetwork:
         """A freshly drawn network. Weights are drawn on the CPU, so that a seed's are the same on every device."""

@@ -106,22 +106,26 @@ class CriticEstimator:
             seen = rollout.reward_rate
             rate = seen if self._rate is None else self._rate + _RATE_STEP * (seen - self._rate)
             self._rate = rate
-        values = values_of(self._critic, rollout)
-        advantages, targets, loss_mask = self._credit(rollout, rollout.rewards - rate * rollout.elapsed, values)
-        return Estimate(advantages, targets, explained_variance(targets, values[:-1], loss_mask), loss_mask)
+        values, next_values = values_of(self._critic, rollout)
+        rewards = rollout.rewards - rate * rollout.elapsed
+        advantages, targets, loss_mask = self._credit(rollout, rewards, values, next_values)
+        return Estimate(advantages, targets, explained_variance(targets, values, loss_mask), loss_mask)
 
-    def _credit(self, rollout: Rollout, rewards: Tensor, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _credit(
+        self, rollout: Rollout, rewards: Tensor, values: Tensor, next_values: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Advantages, value targets and the turns to learn from, (T, B) each."""
         advantages, targets = generalised_advantages(
             rewards,
             rollout.elapsed,
             values,
-            rollout.valid,
-            rollout.alive,
+            next_values,
+            rollout.boundary,
+            rollout.terminated,
             discount=self._discount,
             gae_lambda=self._gae_lambda,
         )
-        return advantages, targets, rollout.valid[:-1]
+        return advantages, targets, rollout.valid
 
     def state(self) -> dict[str, float | None]:
         """The reward rate."""
@@ -138,14 +142,18 @@ class OwnTurns(CriticEstimator):
     For rollouts without a central graph, in which the critic sees what the acting agent does.
     """
 
-    def _credit(self, rollout: Rollout, rewards: Tensor, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _credit(
+        self, rollout: Rollout, rewards: Tensor, values: Tensor, next_values: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         return own_turn_advantages(
             rewards,
             rollout.elapsed,
             values,
+            next_values,
             rollout.agents,
-            rollout.valid,
-            rollout.alive,
+            rollout.column("next", "acting"),
+            rollout.boundary,
+            rollout.terminated,
             discount=self._discount,
             gae_lambda=self._gae_lambda,
         )

@@ -31,6 +31,7 @@ from marl_sched.train.algorithms.base import NAME, AlgorithmConfig, Setup
 from marl_sched.train.bounds import Count, NonNegative, Positive
 from marl_sched.train.collect import Collector, Rollout
 from marl_sched.train.device import device_of
+from marl_sched.train.estimators import seen_by_critic
 from marl_sched.train.learner import Learner
 from marl_sched.train.ppo import between, importance_subsample, means, minibatches
 
@@ -120,11 +121,10 @@ class Imitation:
         return dict(zip(names, means(reports), strict=True))
 
     def _samples(self, rollout: Rollout, rng: np.random.Generator) -> TensorDict:
-        samples, names, rows = importance_subsample(
-            self.policy, rollout, rollout.valid[:-1], self._config.min_keep_prob, rng
+        samples, names, (turn, row) = importance_subsample(
+            self.policy, rollout, rollout.valid, self._config.min_keep_prob, rng
         )
-        turns = rollout.actions.shape[0]
-        truth = {name: v[:turns].flatten(0, 1)[rows].numpy() for name, v in rollout.central.items()}
+        truth = {name: values.numpy() for name, values in seen_by_critic(rollout.data)[row, turn].items()}
         advantages = self._teacher.advantages(truth)
         if self._scale is None:
             self._scale = self._usual(advantages)
@@ -146,8 +146,8 @@ class Imitation:
 
     def _step(self, batch: TensorDict, temperature: float) -> Tensor:
         share = batch["weight"] / batch["weight"].sum()
-        log_probs = self.policy(batch["observation"]).log_softmax(-1)
-        legal = batch["observation"][ACTION_MASK] != 0
+        log_probs = self.policy(batch).log_softmax(-1)
+        legal = batch[ACTION_MASK] != 0
         advantages = torch.where(legal, batch["advantage"], -torch.inf)
         if self._config.criterion == "cross_entropy":
             losses = cross_entropy(log_probs, (advantages / temperature).softmax(-1))

@@ -8,7 +8,6 @@ shares no layers with the policy.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -16,20 +15,20 @@ from msgspec import Struct
 from torch import Tensor, nn
 
 from marl_sched.agents.networks.hetgat.network import HetGATConfig, HetGATCritic
+from marl_sched.agents.networks.network import PolicyNetwork
 from marl_sched.graph import GraphSpec
 from marl_sched.train.advantages import returns_by_time
 from marl_sched.train.algorithms.base import NAME, AlgorithmConfig, Setup
 from marl_sched.train.bounds import Count, Share
-from marl_sched.train.collect import Act, Collector, EpisodeCollector, Rollout
+from marl_sched.train.collect import Collector, EpisodeCollector, Rollout
 from marl_sched.train.device import pick_device
-from marl_sched.train.estimators import Estimate, explained_variance, values_of
+from marl_sched.train.estimators import TIME_LEFT, Estimate, explained_variance, values_of
 from marl_sched.train.learner import Learner, PolicyGradient
 from marl_sched.train.ppo import Ppo, PpoConfig
 
 if TYPE_CHECKING:
     from marl_sched.train.config import TrainConfig
 
-TIME_LEFT = "time_left"
 _UNIT = 100.0  # of the time left and of values, so that a network meets numbers around 1
 
 
@@ -46,13 +45,13 @@ class StateValueConfig(
 
     def build(self, setup: Setup) -> tuple[Collector, Learner]:
         """See AlgorithmConfig."""
-        env = setup.environment(rows=self.instances * self.episodes, episodes=self.episodes)
+        collector = TimedEpisodes(setup.whole_episodes(rows=self.instances * self.episodes, episodes=self.episodes))
         sizes = self.critic
-        critic = StateValue(env.simulator.graph, width=sizes.width, heads=sizes.heads, layers=sizes.layers)
+        critic = StateValue(collector.env.simulator.graph, width=sizes.width, heads=sizes.heads, layers=sizes.layers)
         critic = critic.to(pick_device(setup.config.device))
         estimator = StateValueBaseline(critic, discount=self.discount)
-        learner = PolicyGradient(Ppo(setup.policy(env), critic, self.ppo), estimator)
-        return TimedEpisodes(env, central=False), learner
+        learner = PolicyGradient(Ppo(setup.policy(collector.env), critic, self.ppo), estimator)
+        return collector, learner
 
     def knowledge(self, config: TrainConfig) -> list[str]:
         """The critic's."""
@@ -79,10 +78,12 @@ class StateValue(nn.Module):
 class TimedEpisodes(EpisodeCollector):
     """Whole episodes in which the critic, besides what the acting agent sees, is told the time left."""
 
-    def collect(self, act: Act, length: int) -> Rollout:
+    def collect(self, policy: PolicyNetwork, length: int) -> Rollout:
         """See EpisodeCollector."""
-        rollout = super().collect(act, length)
-        return replace(rollout, central={**rollout.central, TIME_LEFT: (length - rollout.times).float()})
+        rollout = super().collect(policy, length)
+        for states in (rollout.data, rollout.data["next"]):
+            states[TIME_LEFT] = (length - states["progress"]).float()
+        return rollout
 
 
 class StateValueBaseline:
@@ -93,12 +94,12 @@ class StateValueBaseline:
 
     def estimate(self, rollout: Rollout) -> Estimate:
         """Advantages and value targets."""
-        loss_mask, times = rollout.valid[:-1], rollout.times[:-1]
+        loss_mask, times = rollout.valid, rollout.times
         returns = returns_by_time(
-            rollout.rewards, rollout.elapsed, times, loss_mask, discount=self._discount, length=rollout.length
+            rollout.rewards, rollout.elapsed, times, loss_mask, discount=self._discount, length=rollout.horizon
         )
         targets = torch.where(loss_mask, returns.gather(0, torch.where(loss_mask, times, 0)), 0.0)
-        values = values_of(self._critic, rollout)[:-1]
+        values = values_of(self._critic, rollout)[0]
         advantages = torch.where(loss_mask, targets - values, 0.0)
         return Estimate(advantages, targets, explained_variance(targets, values, loss_mask), loss_mask)
 

@@ -27,10 +27,10 @@ class StepBaselineConfig(
 
     def build(self, setup: Setup) -> tuple[Collector, Learner]:
         """See AlgorithmConfig."""
-        env = setup.environment(rows=self.instances * self.episodes, episodes=self.episodes)
+        collector = EpisodeCollector(setup.whole_episodes(rows=self.instances * self.episodes, episodes=self.episodes))
         estimator = StepBaseline(discount=self.discount, episodes=self.episodes)
-        learner = PolicyGradient(Ppo(setup.policy(env), None, self.ppo), estimator)
-        return EpisodeCollector(env, central=False), learner
+        learner = PolicyGradient(Ppo(setup.policy(collector.env), None, self.ppo), estimator)
+        return collector, learner
 
 
 class StepBaseline:
@@ -44,13 +44,13 @@ class StepBaseline:
         advantages = step_baseline_advantages(
             rollout.rewards,
             rollout.elapsed,
-            rollout.times[:-1],
-            rollout.valid[:-1],
+            rollout.times,
+            rollout.valid,
             discount=self._discount,
-            length=rollout.length,
+            length=rollout.horizon,
             episodes=self._episodes,
         )
-        return Estimate(advantages, None, 0.0, rollout.valid[:-1])
+        return Estimate(advantages, None, 0.0, rollout.valid)
 
     def state(self) -> dict[str, float | None]:
         """Nothing."""

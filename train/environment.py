@@ -1,0 +1,218 @@
+"""The TorchRL environment that training plays on, and what its workers need to make one.
+
+Beside what `SchedulingTorchRL` gives, the tensordict holds
+
+    progress     (B,)            int64    how far the episode has come, in the domain's unit
+    central      nested          the observation's arrays under the full view, for a critic or a teacher; optional
+    memory       (B, M, size)    float32  what a recurrent policy carries (marl_sched.agents.base); optional
+
+An episode is cut (`truncated`) when its length has passed, which the curriculum gives at the row's reset. Everything
+random is named by numbers (which episode of the run a row plays, counter-based noise), so that what a row plays depends
+on nothing but its number among all rows of the run, whichever process holds it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torchrl.data import Composite, Unbounded
+
+from marl_sched.domain import Domain, get_domain
+from marl_sched.envs.api.torchrl_env import SchedulingTorchRL
+from marl_sched.errors import InvalidOptionError
+from marl_sched.graph import ACTION_MASK
+from marl_sched.noise import instance_generator
+from marl_sched.simulation import SavedState
+from marl_sched.train.curriculum import EpisodeLength
+
+CENTRAL, MEMORY = "central", "memory"
+
+
+class InstanceSource:
+    """The instances of a run: of `rows` rows, row b's episode n plays instance (n rows + b) // episodes.
+
+    An instance depends on (seed, its number) and on its scale, and scales take turns. All are of the split "train",
+    which neither validation nor evaluation meets.
+    """
+
+    def __init__(self, domain: Domain, scales: Sequence[str], *, seed: int, rows: int, episodes: int = 1) -> None:
+        self._domain, self._scales, self._seed = domain, tuple(scales), seed
+        self._rows, self._episodes = rows, episodes
+
+    def __call__(self, row: int, count: int) -> Any:
+        """The instance that a row plays in its episode `count`."""
+        number = (count * self._rows + row) // self._episodes
+        rng = instance_generator(self._seed, number, "train")
+        return self._domain.generate(self._scales[number % len(self._scales)], rng)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingTask:
+    """What a run plays: plain values, which can be sent to a worker.
+
+    Attributes:
+        domain, scales, objective, view, options: as marl_sched.train.config.TrainConfig has them.
+        seed: of instances and noise.
+        rows: episodes at once, over all workers.
+        episodes: rows that play the same instance.
+        length: of episodes.
+        turns: turns of a row in an update, None where an update is a whole episode. Rows then play on from update to
+            update, and their first episodes are cut at different times, so that from then on every part of an episode
+            is in every update.
+        central: give the full view beside the agents' own.
+        memory: (M, size) of a recurrent policy's memory, see marl_sched.agents.base.
+        skip: episodes of each row that are left out, as those that a run had begun before it was stopped.
+    """
+
+    domain: str
+    scales: Sequence[str]
+    objective: str
+    view: Mapping[str, Any]
+    options: Mapping[str, Any] = field(default_factory=dict)
+    seed: int
+    rows: int
+    episodes: int = 1
+    length: EpisodeLength
+    turns: int | None = None
+    central: bool = False
+    memory: tuple[int, int] = (0, 0)
+    skip: int = 0
+
+    def environment(self, first: int = 0, rows: int | None = None) -> TrainingEnv:
+        """The environment of rows `first` to `first + rows - 1`, None: of all."""
+        return TrainingEnv(self, first, self.rows if rows is None else rows)
+
+
+class TrainingEnv(SchedulingTorchRL):
+    """Rows of a run; see the module's page.
+
+    Attributes:
+        task: what is played.
+        episode_length: of the episodes that begin next, where an update is a whole episode; else the curriculum's.
+    """
+
+    changing: ClassVar[tuple[str, ...]] = (*SchedulingTorchRL.changing, "_cut", "_steps", "_memory")
+
+    def __init__(self, task: TrainingTask, first: int, rows: int) -> None:
+        domain = get_domain(task.domain)
+        self.task, self._first_row = task, first
+        self.episode_length = task.length(0)
+        self._steps, self._resumes = 0, False  # steps of every row; whether the next reset begins nothing
+        self._cut = np.zeros(rows, np.int64)  # where each row's episode is cut, in the domain's unit
+        self._memory = torch.zeros(rows, *task.memory)
+        source = InstanceSource(domain, task.scales, seed=task.seed, rows=task.rows, episodes=task.episodes)
+        super().__init__(
+            domain,
+            batch_size=rows,
+            scale=max(task.scales, key=list(domain.scales).index),
+            source=lambda row, count: source(first + row, count),
+            view=domain.make_view(task.view),
+            objective=task.objective,
+            horizon=2 * task.length.longest,  # cuts come before the end, so that a state at a cut still has a value
+            seed=task.seed,
+            **task.options,
+        )
+
+    def _make_specs(self) -> None:
+        super()._make_specs()
+        batch = self.batch_size
+        self.observation_spec["progress"] = Unbounded(batch, dtype=torch.int64)
+        if self.task.central:
+            names = list(self.simulator.arrays)
+            self.observation_spec[CENTRAL] = Composite(
+                {n: self.observation_spec[n].clone() for n in names}, shape=batch
+            )
+        if self.task.memory[1]:
+            self.observation_spec[MEMORY] = Unbounded((*batch, *self.task.memory), dtype=torch.float32)
+
+    def _set_seed(self, seed: int | None) -> None:
+        super()._set_seed(seed)
+        self._count += self.task.skip
+
+    def _find_instances(self) -> None:
+        super()._find_instances()
+        self._first, self._stride = self._first + self._first_row, np.full_like(self._stride, self.task.rows)
+
+    def _start(self, rows: np.ndarray) -> None:
+        fresh = self._count < self.task.skip  # a row's first episode
+        super()._start(rows)
+        self._memory = torch.where(torch.from_numpy(rows)[:, None, None], 0.0, self._memory)
+        if self.task.turns is None:
+            self._cut[rows] = self.episode_length
+            return
+        length = self.task.length(self._steps // self.task.turns)
+        number = self._first_row + np.arange(len(rows))
+        staggered = np.maximum(length * (number + 1) // self.task.rows, 1)
+        self._cut[rows] = np.where(fresh, staggered, length)[rows]
+
+    def state_arrays(self) -> dict[str, np.ndarray]:
+        """Where the rows stand, as arrays for a checkpoint; instances are named by the rows' counts of episodes."""
+        simulator = {f"simulator.{name}": _as_bytes(a) for name, a in self.simulator.save_state().arrays.items()}
+        own = {"count": self._count.copy(), "cut": self._cut.copy(), "memory": self._memory.numpy().copy()}
+        return {**simulator, **own, "steps": np.array([self._steps])}
+
+    def load_arrays(self, state: Mapping[str, np.ndarray]) -> None:
+        """Go on from `state_arrays`, in an environment that was made for the same task: the next reset of all rows
+        gives the present turn and begins nothing.
+        """
+        live = self.simulator.live_arrays()
+        arrays = {name: _from_bytes(state[f"simulator.{name}"], array) for name, array in live.items()}
+        self._count, self._cut = state["count"].copy(), state["cut"].copy()
+        self._memory, self._steps = torch.from_numpy(state["memory"].copy()), int(state["steps"][0])
+        if (self._count < self.task.skip).any():  # saved before the first episode began
+            return
+        instances = tuple(self._instances(range(len(self._count)), self._count))
+        self.simulator.load_state(SavedState(type(self.simulator).__name__, arrays, instances))
+        self._resumes = True
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **options: Any) -> TensorDictBase:
+        if self._resumes and (tensordict is None or tensordict.get("_reset", None) is None):
+            self._resumes = False
+            return self.current()
+        return super()._reset(tensordict, **options)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self._steps += 1
+        carried = tensordict.get(("next", MEMORY), None)
+        if carried is not None:
+            self._memory = carried
+        return super()._step(tensordict)
+
+    def _turn_entries(self) -> dict[str, Any]:
+        out: dict[str, Any] = super()._turn_entries()
+        progress = self.simulator.progress
+        cut = torch.from_numpy((progress >= self._cut)[:, None])
+        out["progress"] = torch.from_numpy(progress.copy())
+        out["truncated"] = (out["truncated"] | cut) & ~out["terminated"]
+        out["done"] = out["terminated"] | out["truncated"]
+        if self.task.central:
+            central = self.simulator.observe_all()
+            central[ACTION_MASK] = central[ACTION_MASK] != 0
+            out[CENTRAL] = {name: torch.from_numpy(array) for name, array in central.items()}
+        if self.task.memory[1]:
+            out[MEMORY] = self._memory
+        return out
+
+
+def _as_bytes(array: np.ndarray) -> np.ndarray:
+    """An array of any type, records included, as uint8; what pads a record's fields is 0."""
+    plain = np.zeros(array.shape, array.dtype)
+    if array.dtype.names is None:
+        plain[...] = array
+    for name in array.dtype.names or ():
+        plain[name] = array[name]
+    return np.frombuffer(plain.tobytes(), np.uint8).copy()
+
+
+def _from_bytes(saved: np.ndarray, like: np.ndarray) -> np.ndarray:
+    """The array that `_as_bytes` saved, with the shape and type of `like`; InvalidOptionError for another size."""
+    if saved.nbytes != like.nbytes:
+        raise InvalidOptionError(
+            f"checkpoint: expected {like.nbytes} bytes of the simulator's state, got {saved.nbytes}"
+        )
+    return np.frombuffer(saved.tobytes(), like.dtype).reshape(like.shape)
