@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from marl_sched.agents.base import Scheduler
 from marl_sched.agents.policies.cards import Mode, PolicyCard, read_card
-from marl_sched.domain import Domain, get_domain
+from marl_sched.domain import Domain, domain_names, get_domain
 from marl_sched.errors import InvalidFileError, InvalidOptionError, MarlSchedError, UnknownNameError
 from marl_sched.plugins import SCHEDULERS, import_object, is_object_name, load_offered, offered
 
@@ -128,19 +128,31 @@ def card_of(name_or_path: str | Path, domain: Domain | str) -> PolicyCard | None
 def policy_path(name_or_path: str | Path) -> Path:
     """Where a policy's weights or card are: a path as it is, a shipped name in its folder.
 
-    Raises UnknownNameError for a name that does not ship.
+    Raises UnknownNameError for a name that does not ship, InvalidOptionError for the name of a rule.
     """
     if _is_path(name_or_path):
         return Path(name_or_path)
     if str(name_or_path) in shipped_policies():
         return SHIPPED / f"{name_or_path}.safetensors"
+    for domain in domain_names():
+        if str(name_or_path) in rules(domain):
+            raise InvalidOptionError(
+                f"policy {name_or_path}: expected a trained policy, but this is a rule of {domain}: "
+                f"marl_sched.agents.create_scheduler({str(name_or_path)!r}, {domain!r}) makes it"
+            )
     raise UnknownNameError("policy", str(name_or_path), shipped_policies())
 
 
 def _require_known(name_or_path: str | Path, domain: str) -> None:
-    """UnknownNameError for a name, not a path, that no scheduler of the domain has."""
-    if not _is_path(name_or_path) and str(name_or_path) not in scheduler_names(domain):
-        raise UnknownNameError("scheduler", str(name_or_path), scheduler_names(domain))
+    """UnknownNameError for a name, not a path, that no scheduler has, InvalidOptionError for another domain's."""
+    name = str(name_or_path)
+    if _is_path(name_or_path) or name in scheduler_names(domain):
+        return
+    for other in domain_names():
+        if name in scheduler_names(other):
+            known = ", ".join(scheduler_names(domain))
+            raise InvalidOptionError(f"scheduler {name}: is one of {other}, expected one of {domain}: {known}")
+    raise UnknownNameError("scheduler", name, scheduler_names(domain))
 
 
 def _is_path(name_or_path: str | Path) -> bool:

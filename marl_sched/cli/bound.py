@@ -63,7 +63,7 @@ def bound(
     What couples the instance's parts is relaxed at a price that varies over the episode; what remains is solved
     exactly, part by part. Takes a minute or so per price vector.
     """
-    from marl_sched.files import write_json
+    from marl_sched.files import STDOUT, write_json
 
     options.check_output(json)
     problem = bounded.problem()
@@ -82,14 +82,14 @@ def bound(
         "M1": {"mean": float(values.mean()), "std": float(values.std())},
         "per_instance": [float(value) for value in values],
     }
+    typer.echo(_sentence(result), err=json == STDOUT)
     if json is not None:
         write_json(json, result)
-    typer.echo(_sentence(result))
 
 
 def _prove(problem: Problem, price_vectors: int) -> np.ndarray:
-    """The bound of each instance, float64 (B,); a spinner tells how far it is."""
-    from rich.console import Console
+    """The bound of each instance, float64 (B,); tells on stderr how far it is."""
+    from marl_sched.cli.progress import progress
 
     if problem.domain.bound is None:
         raise InvalidOptionError(f"--env: no bound is known for the environment {problem.domain.name!r}")
@@ -97,14 +97,14 @@ def _prove(problem: Problem, price_vectors: int) -> np.ndarray:
     known = inspect.signature(bounds.Relaxation).parameters
     for name in problem.options:
         require(f"option of the bound of {problem.domain.name}", name, known)
-    with Console(stderr=True).status("bounding") as status:
+    with progress() as tell:
         relaxation = bounds.Relaxation(
             problem.instances, objective=problem.objective, horizon=problem.horizon, **problem.options
         )
         found = bounds.upper_bounds(
             relaxation,
             price_vectors=price_vectors,
-            progress=lambda done, total: status.update(f"price vector {done + 1} of {total}"),
+            progress=lambda done, total: tell("bounding", done / total),
         )
     return found.value
 

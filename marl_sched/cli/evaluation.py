@@ -77,26 +77,15 @@ def compare(
 
 
 def play(resolved: Resolved, baseline: str | None) -> dict[str, Any]:
-    """Evaluate what was selected, with a progress bar on stderr where there is a terminal; schema 2."""
-    from rich.console import Console
-    from rich.progress import Progress
-
+    """Evaluate what was selected, and tell on stderr how far it is; schema 2."""
     from marl_sched.agents.registry import create_scheduler
+    from marl_sched.cli.progress import progress
     from marl_sched.train.evaluation.evaluate import evaluate
     from marl_sched.train.malloc import keep_freed_memory
 
     keep_freed_memory()
     domain = resolved.problem.domain
-    console = Console(stderr=True)
-    bar = Progress(console=console, transient=True, disable=not console.is_terminal)
-    with told_of_compilation(), bar as progress:
-        tasks: dict[str, Any] = {}
-
-        def tell(name: str, done: float) -> None:
-            if name not in tasks:
-                tasks[name] = progress.add_task(name, total=1.0)
-            progress.update(tasks[name], completed=done)
-
+    with told_of_compilation(), progress() as tell:
         table = evaluate(
             resolved.problem,
             resolved.schedulers,
@@ -118,12 +107,12 @@ def bench(
     """Measure how fast the simulator, its environment APIs and the policy are on this machine, on one thread."""
     from marl_sched.cli.tables import print_bench
     from marl_sched.domain import get_domain
-    from marl_sched.files import write_json
+    from marl_sched.files import STDOUT, write_json
     from marl_sched.train.bench import bench as measure
 
     options.check_output(json)
     with told_of_compilation():
         figures = measure(get_domain(env), repeats=repeats, batch=batch)
+    print_bench(figures, stderr=json == STDOUT)
     if json is not None:
         write_json(json, figures)
-    print_bench(figures)

@@ -141,8 +141,8 @@ def _caption(results: dict[str, Any]) -> str:
     )
 
 
-def print_bench(figures: dict[str, Any]) -> None:
-    """The figures of `marl-sched bench`, each with what it is of."""
+def print_bench(figures: dict[str, Any], *, stderr: bool = False) -> None:
+    """The figures of `marl-sched bench`, each with what it is of, to standard output or standard error."""
     title = f"{figures['env']}: {figures['threads']} thread, {figures['statistic']} ({figures['repeats']})"
     table = Table("figure", "value", "of", title=title, box=box.SIMPLE_HEAD)
     for name, meaning in figures["meaning"].items():
@@ -152,7 +152,7 @@ def print_bench(figures: dict[str, Any]) -> None:
         )
         for label, number in parts.items():
             table.add_row(label, f"{number:,.2f}", meaning)
-    Console().print(table)
+    Console(stderr=stderr).print(table)
 
 
 def _other_measures(results: dict[str, Any]) -> list[str]:

@@ -73,7 +73,7 @@ def test_a_shipped_policy_is_found_by_its_name_in_its_own_domain_only(shipped):
     assert isinstance(policy, NetworkPolicy)
     assert (policy.name, policy.mode) == ("mine", "sample")
     assert load_policy("mine").card == policy.card
-    with pytest.raises(UnknownNameError, match="unknown scheduler 'mine'"):
+    with pytest.raises(InvalidOptionError, match="scheduler mine: is one of airme, expected one of murse"):
         create_scheduler("mine", "murse")
 
 
@@ -108,3 +108,16 @@ def test_listing_and_rules_need_no_torch():
         "create_scheduler(scheduler_names('airme')[0], 'airme'); sys.exit('torch' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_a_rule_asked_for_as_a_trained_policy_is_named_with_what_makes_it():
+    with pytest.raises(InvalidOptionError, match=r"rule of airme: .*create_scheduler\('preventive-first', 'airme'\)"):
+        load_policy("preventive-first")
+
+
+@pytest.mark.parametrize(
+    ("name", "owner", "domain"), [("edf", "murse", "airme"), ("airme-full-profit", "airme", "murse")]
+)
+def test_another_domains_scheduler_is_named_as_such(name, owner, domain):
+    with pytest.raises(InvalidOptionError, match=f"scheduler {name}: is one of {owner}, expected one of {domain}: "):
+        create_scheduler(name, domain)
