@@ -232,8 +232,8 @@ class Domain:
         """The domain's simulator of these instances; an objective from outside pays its rewards, if it is asked for."""
         from marl_sched.objective import ScoredSimulator, outside_objective
 
-        name = options.get("objective")
-        outside = None if name is None else outside_objective(self, name)
+        name = str(options.get("objective", self.objectives[0]))
+        outside = outside_objective(self, name)
         if outside is None:
             return self.simulator(instances, **options)
         return ScoredSimulator(self.simulator(instances, **{**options, "objective": self.objectives[0]}), name, outside)

@@ -75,6 +75,7 @@ class ScoredSimulator(TurnSimulator):
         self.inner, self._name, self._objective = inner, name, objective
         self.reward = np.zeros(inner.batch)
         self.rewards = np.zeros((inner.batch, len(objective.parts)))
+        self._paid = np.zeros_like(self.rewards)  # the totals up to now
         self._begin(np.ones(inner.batch, np.bool_))
 
     def __getattr__(self, name: str) -> Any:
@@ -86,9 +87,7 @@ class ScoredSimulator(TurnSimulator):
     def _begin(self, rows: np.ndarray) -> None:
         self._objective.start(self.inner, rows)
         self.reward[rows] = self.rewards[rows] = 0.0
-        before = self._paid.copy() if hasattr(self, "_paid") else np.zeros_like(self.rewards)
-        before[rows] = self._objective.total(self.inner)[rows]
-        self._paid = before
+        self._paid = np.where(rows[:, None], self._objective.total(self.inner), self._paid)
 
     def reset(
         self,
