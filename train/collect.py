@@ -228,15 +228,14 @@ class SegmentCollector:
         return {
             "frames_per_batch": self.task.rows * self._turns,
             "total_frames": -1,
-            "use_buffers": False,
-            "auto_register_policy_transforms": False,
         }
 
     def _start(self, module: ActingLogits) -> Any:
         device = device_of(module.network)
         return SyncCollector(
             self.env, actor(module), policy_device=device, env_device="cpu", storing_device="cpu",
-            track_traj_ids=False, **self._options(),
+            track_traj_ids=False, use_buffers=False, auto_register_policy_transforms=False,
+            **self._options(),
         )  # fmt: skip
 
     def _synchronise(self, module: ActingLogits) -> None:

@@ -28,6 +28,7 @@ from marl_sched.errors import InvalidFileError, InvalidOptionError
 from marl_sched.files import read_json
 from marl_sched.train.algorithms.base import AlgorithmConfig, algorithm_config
 from marl_sched.train.bounds import Count, Group, Natural, NonNegative, Seed
+from marl_sched.train.callbacks import LoggerName
 from marl_sched.train.collect import CollectorName
 from marl_sched.train.device import DeviceName
 from marl_sched.train.groups import chosen_domain, offer
@@ -87,7 +88,7 @@ class CollectorConfig(Group, frozen=True, kw_only=True):
 class TrainConfig(Group, frozen=True, kw_only=True):
     """A whole run; `configs/train.yaml`. `start_from`: a policy, by name or path, to go on from.
 
-    `device`: where networks learn (marl_sched.train.device).
+    `device`: where networks learn (marl_sched.train.device), `logger`: one more place for the log's numbers.
     """
 
     env: EnvConfig
@@ -102,6 +103,7 @@ class TrainConfig(Group, frozen=True, kw_only=True):
     updates: Count
     threads: Count
     device: DeviceName
+    logger: LoggerName | None
     run_dir: str | None
     save_every: Count
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -16,10 +17,10 @@ from msgspec import structs
 from marl_sched.agents.policies.cards import source_revision
 from marl_sched.errors import InvalidOptionError
 from marl_sched.files import write_json
+from marl_sched.train.callbacks import Callback, LoggerCallback, Run
 from marl_sched.train.checkpoint import Counters
 from marl_sched.train.collect import Rollout
-from marl_sched.train.config import RunRecord, load_config, load_record
-from marl_sched.train.device import described, device_of
+from marl_sched.train.config import RunRecord, TrainConfig, load_config, load_record
 from marl_sched.train.export import CONFIG
 from marl_sched.train.guard import exclusive, stopping
 from marl_sched.train.logging import RunLog
@@ -29,12 +30,14 @@ from marl_sched.train.parts import Parts, build
 _SAMPLES = 2  # last word of the seeds that pick and order samples
 
 
-def train_from_overrides(overrides: Sequence[str], *, quiet: bool = False) -> Path:
-    """Run `marl-sched train` with Hydra overrides such as `view=local`; the directory that holds the run.
+def train(
+    config: TrainConfig, callbacks: Sequence[Callback] = (), *, overrides: Sequence[str] = (), quiet: bool = False
+) -> Path:
+    """Train as a configuration says (`load_config`); the directory that holds the run.
 
-    Raises InvalidOptionError for a bad override or a directory that holds a run already.
+    `callbacks` are called in their order, after the run's own log; `overrides` are those that gave the configuration,
+    for the command on the policy's card. Raises InvalidOptionError for a directory that holds a run already.
     """
-    config = load_config(overrides)
     directory = Path(config.directory())
     with exclusive(directory):
         if (directory / CONFIG).exists():
@@ -48,10 +51,18 @@ def train_from_overrides(overrides: Sequence[str], *, quiet: bool = False) -> Pa
             parts = replace(parts, record=structs.replace(record, start=parts.start_from(config.start_from)))
         parts.save(counters, directory)  # first, so that whatever holds a run can be resumed
         write_json(directory / CONFIG, msgspec.to_builtins(parts.record))
-        return train(parts, counters, directory, quiet=quiet)
+        return _loop(parts, counters, directory, callbacks, quiet=quiet)
 
 
-def resume(run_dir: str | Path, *, quiet: bool = False) -> Path:
+def train_from_overrides(overrides: Sequence[str], *, quiet: bool = False) -> Path:
+    """Run `marl-sched train` with Hydra overrides such as `view=local`; the directory that holds the run.
+
+    Raises InvalidOptionError for a bad override or a directory that holds a run already.
+    """
+    return train(load_config(overrides), overrides=overrides, quiet=quiet)
+
+
+def resume(run_dir: str | Path, callbacks: Sequence[Callback] = (), *, quiet: bool = False) -> Path:
     """Go on with a run from its last checkpoint as if it had not stopped: exactly so on a CPU.
 
     On a GPU sums are made in no fixed order. A checkpoint is not bound to the device on which it was made. If the
@@ -65,24 +76,25 @@ def resume(run_dir: str | Path, *, quiet: bool = False) -> Path:
             write_json(directory / CONFIG, msgspec.to_builtins(record))
             warnings.warn(f"{directory}: goes on with another source than before: {record.source}", stacklevel=2)
         parts = build(record)
-        return train(parts, parts.restore(directory), directory, quiet=quiet)
+        return _loop(parts, parts.restore(directory), directory, callbacks, quiet=quiet)
 
 
-def train(parts: Parts, counters: Counters, directory: Path, *, quiet: bool = False) -> Path:
+def _loop(parts: Parts, counters: Counters, directory: Path, callbacks: Sequence[Callback], *, quiet: bool) -> Path:
     """The loop. Everything random in an update is a function of (seed, update, instance number).
 
     The first SIGINT or SIGTERM ends it after the running update, with a checkpoint.
     """
-    config = parts.record.config
+    config, run = parts.record.config, Run(parts, counters, directory)
     torch.set_num_threads(config.threads)
     keep_freed_memory()
-    device = described(device_of(parts.learner.policy))
-    log = RunLog(directory, updates=config.updates, start=counters.update, device=device, quiet=quiet)
-    with stopping() as stop, log:
+    own = [RunLog(quiet=quiet), *([] if config.logger is None else [LoggerCallback(config.logger)])]
+    with stopping() as stop, _called([*own, *callbacks], run) as everyone:
         while counters.update < config.updates and not stop.requested:
             started = time.perf_counter()
             update = counters.update
             rollout = parts.collector.collect(parts.learner.policy, parts.length(update))
+            for callback in everyone:
+                callback.on_rollout(run, rollout)
             rng = np.random.default_rng([config.seed, update, _SAMPLES])
             report = parts.learner.learn(rollout, update / config.updates, rng)
             counters.update += 1
@@ -90,7 +102,11 @@ def train(parts: Parts, counters: Counters, directory: Path, *, quiet: bool = Fa
             counters.decisions += rollout.decisions
             scores = parts.validate(counters, directory)
             counters.seconds += time.perf_counter() - started
-            log.update(_row(counters, rollout) | report | scores)
+            for callback in everyone if scores else ():
+                callback.on_validation(run, scores["validation"])
+            values = _row(counters, rollout) | report | scores
+            for callback in everyone:
+                callback.on_update(run, values)
             parts.save(counters, directory)
         if stop.requested:
             parts.save(counters, directory, now=True)
@@ -98,8 +114,24 @@ def train(parts: Parts, counters: Counters, directory: Path, *, quiet: bool = Fa
     return directory
 
 
+@contextmanager
+def _called(callbacks: Sequence[Callback], run: Run) -> Iterator[Sequence[Callback]]:
+    """Start callbacks, and end those that started and the collector's workers whatever happens in between."""
+    with ExitStack() as stack:
+        stack.callback(run.parts.collector.close)
+        for callback in callbacks:
+            stack.callback(callback.on_end, run)
+            callback.on_start(run)
+        yield callbacks
+
+
 def _row(counters: Counters, rollout: Rollout) -> dict[str, float]:
-    """What is logged of an update beside the learner's report, by the names of marl_sched.train.logging.COLUMNS."""
+    """What is logged of an update beside the learner's report."""
     done = asdict(counters)
     del done["best"]  # told with the validation that found it
-    return {**done, "reward_rate": rollout.reward_rate, "length": rollout.length}
+    return {
+        **done,
+        "reward_rate": rollout.reward_rate,
+        "length": rollout.length,
+        "frames_per_second": rollout.decisions / rollout.seconds,
+    }

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,11 +14,13 @@ from marl_sched.agents.policies.cards import read_card, source_revision
 from marl_sched.agents.policies.network_policy import NetworkPolicy
 from marl_sched.errors import InvalidFileError, InvalidOptionError
 from marl_sched.files import read_json, write_json
+from marl_sched.train.callbacks import Callback, Run
 from marl_sched.train.checkpoint import Counters
+from marl_sched.train.collect import Rollout
 from marl_sched.train.config import RunRecord, load_config, load_record
 from marl_sched.train.logging import RunLog
 from marl_sched.train.parts import build
-from marl_sched.train.run import resume, train_from_overrides
+from marl_sched.train.run import resume, train, train_from_overrides
 from marl_sched.train.validation import Validation
 
 TINY = [
@@ -41,14 +44,14 @@ class StoppedError(Exception):
 
 
 def stop_in_update(monkeypatch: pytest.MonkeyPatch, update: int) -> None:
-    original = RunLog.update
+    original = RunLog.on_update
 
-    def interrupted(self: RunLog, values: dict[str, float]) -> None:
-        original(self, values)
+    def interrupted(self: RunLog, run: Run, values: dict[str, float]) -> None:
+        original(self, run, values)
         if values["update"] == update:
             raise StoppedError
 
-    monkeypatch.setattr(RunLog, "update", interrupted)
+    monkeypatch.setattr(RunLog, "on_update", interrupted)
 
 
 def checkpoint(directory: Path) -> dict[str, np.ndarray]:
@@ -58,7 +61,10 @@ def checkpoint(directory: Path) -> dict[str, np.ndarray]:
 
 def rows(directory: Path) -> list[dict[str, str]]:
     with (directory / "progress.csv").open(newline="") as file:
-        return [{name: value for name, value in row.items() if name != "seconds"} for row in csv.DictReader(file)]
+        return [
+            {name: value for name, value in row.items() if name not in ("seconds", "frames_per_second")}
+            for row in csv.DictReader(file)
+        ]
 
 
 @pytest.mark.parametrize(
@@ -213,3 +219,39 @@ def test_the_best_score_is_the_lowest_where_lower_is_better(better: str, best: f
     assert validation.prefers(best, 0.6)
     assert not validation.prefers(0.6, best)
     assert not validation.prefers(best, best)
+
+
+def test_hooks_are_called_in_their_order_and_leave_the_run_as_it_is(tmp_path: Path):
+    called: list[str] = []
+
+    class Listening(Callback):
+        def on_start(self, run: Run) -> None:
+            called.append(f"start {run.counters.update}")
+
+        def on_rollout(self, run: Run, rollout: Rollout) -> None:
+            called.append(f"rollout {rollout.turns}")
+
+        def on_validation(self, run: Run, score: float) -> None:
+            called.append("validation")
+
+        def on_update(self, run: Run, values: Mapping[str, float]) -> None:
+            called.append(f"update {values['update']}")
+
+        def on_end(self, run: Run) -> None:
+            called.append("end")
+
+    config = load_config([*GAE, "updates=2", f"run_dir={tmp_path / 'heard'}"])
+    heard = train(config, [Listening()], quiet=True)
+    once = ["rollout 12", "update 1", "rollout 12", "validation", "update 2"]
+    assert called == ["start 0", *once, "end"]
+    alone = train_from_overrides([*GAE, "updates=2", f"run_dir={tmp_path / 'alone'}"], quiet=True)
+    assert rows(heard) == rows(alone)
+
+
+def test_the_logs_columns_are_what_was_logged_and_a_logger_is_a_word(tmp_path: Path):
+    words = [*STEP_BASELINE, "updates=2", "logger=csv", f"run_dir={tmp_path / 'run'}"]
+    directory = train_from_overrides(words, quiet=True)
+    columns = rows(directory)[0].keys()
+    assert "kl" in columns
+    assert "regret" not in columns
+    assert list((directory / "loggers").rglob("reward_rate.csv"))

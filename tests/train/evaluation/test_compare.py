@@ -80,13 +80,6 @@ def test_a_learning_curve_has_the_validated_rows_in_minutes(tmp_path):
     assert scores.tolist() == [0.5, 0.625]
 
 
-def test_the_columns_of_a_training_log_are_those_that_are_drawn():
-    from marl_sched.train.evaluation import compare
-    from marl_sched.train.logging import COLUMNS
-
-    assert {compare.SECONDS, compare.SCORE} <= set(COLUMNS)
-
-
 @pytest.mark.parametrize(("better", "best"), [("higher", "0.610"), ("lower", "0.500")])
 def test_the_best_validation_is_marked(better, best):
     figure = plots.learning_curves({"run": (np.array([1.0, 2.0, 3.0]), np.array([0.5, 0.61, 0.6]))}, better=better)
