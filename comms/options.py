@@ -13,10 +13,12 @@ from marl_sched.domain import Domain, Telemetry, get_domain
 from marl_sched.errors import InvalidOptionError, require
 
 if TYPE_CHECKING:
+    from marl_sched.comms.plant import SimulatedPlant
     from marl_sched.simulation import TurnSimulator
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 Sync = Literal["never", "commit"]
+Conflict = Literal["turns", "priority"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,6 +35,8 @@ class WorldOptions:
         view, view_options: what agents see.
         run: the run's name, part of every key.
         listen: endpoint, port 0 takes a free one.
+        conflict: `turns`: free agents decide in turn and see each other's choices as their view allows; `priority`: all
+            free agents choose at once, and a draw settles who gets what several chose, as in the Parallel API.
         clock: who owns time: `lockstep`, `paced` or `free`; see WorldRules.
         pace: seconds per unit of simulated time, of the paced clock.
         deadline: a decision may take that long; a late one idles the agent for this decision epoch.
@@ -61,6 +65,7 @@ class WorldOptions:
     view_options: Mapping[str, int | float] = field(default_factory=dict)
     run: str = "run"
     listen: str = DEFAULT_ENDPOINT
+    conflict: Conflict = "turns"
     clock: ClockKind = "lockstep"
     pace: float = 1.0
     deadline: float = 2.0
@@ -78,6 +83,7 @@ class WorldOptions:
     def __post_init__(self) -> None:
         """Refuse what cannot be run."""
         run_prefix(self.run)
+        require("conflict", self.conflict, get_args(Conflict))
         require("clock", self.clock, get_args(ClockKind))
         require("sync", self.sync, get_args(Sync))
         _require_positive(self, "pace", "deadline", "standstill", "ready_timeout", "heartbeat", "lease")
@@ -140,6 +146,13 @@ class WorldOptions:
             **extra,
         )
 
+    def plant(self, **extra: Any) -> SimulatedPlant:
+        """The plant at the start of its episode; `extra` as for `simulator`."""
+        from marl_sched.comms.plant import SimulatedPlant, SimultaneousPlant
+
+        kind = SimultaneousPlant if self.conflict == "priority" else SimulatedPlant
+        return kind(self.domain(), self.telemetry(), self.simulator(**extra))
+
     def chosen_objective(self) -> str:
         """The objective, or UnknownNameError."""
         domain = self.domain()
@@ -147,7 +160,7 @@ class WorldOptions:
 
     def problem(self) -> dict[str, Any]:
         """The options that decide how the plant behaves, and which instance it is, as a run's log has them."""
-        names = ("env", "scale", "instance", "seed", "horizon", "objective", "view")
+        names = ("env", "scale", "instance", "seed", "horizon", "objective", "view", "conflict")
         given: dict[str, Any] = {name: getattr(self, name) for name in names}
         identity = int(self.load_instance().identity)
         return {**given, "view_options": dict(self.view_options), "identity": f"{identity:016x}"}

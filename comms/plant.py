@@ -11,6 +11,7 @@ import numpy as np
 from marl_sched.comms.protocol.events import Choice, Outcome, PlantAdvanced, Request
 from marl_sched.domain import Domain, Telemetry
 from marl_sched.graph import ACTION_MASK, VISIBLE_SHARE
+from marl_sched.noise import Stream, uniforms
 from marl_sched.simulation import TurnSimulator
 
 IDLE = 0
@@ -111,3 +112,64 @@ class SimulatedPlant:
         objectives = {name: float(values[0]) for name, values in self.simulator.objectives().items()}
         series = self.telemetry.series(self.simulator)
         return {"time": int(self.simulator.time[0]), "objectives": objectives, **series}
+
+
+class SimultaneousPlant(SimulatedPlant):
+    """A domain's simulator in which all free agents choose at once, on the same state; see Plant.
+
+    Where several choose one action, the one with the smallest uniform of stream CONFLICT at (time, action, agent) has
+    it and the others meet a conflict, so a run equals that of the Parallel API with the same actions.
+    """
+
+    def state(self) -> PlantAdvanced:
+        """See Plant.state."""
+        state = super().state()
+        if state.over:
+            return state
+        requests = tuple(self._request(agent) for agent in self.simulator.free_agents(0).tolist())
+        return PlantAdvanced(state.tick, requests, state.changed)
+
+    def apply(self, choices: Sequence[Choice]) -> list[Commit]:
+        """See Plant.apply."""
+        simulator, tick = self.simulator, int(self.simulator.time[0])
+        actions, outcomes, shares, rewards = {}, {}, {}, dict.fromkeys((c.agent for c in choices), 0.0)
+        for choice in choices:
+            observation = simulator.observe(np.array([choice.agent]), self._observation)
+            possible = choice.action < simulator.max_actions and observation[ACTION_MASK][0, choice.action]
+            actions[choice.agent] = choice.action if possible else IDLE
+            outcomes[choice.agent] = choice.outcome if possible else Outcome.ILLEGAL
+            shares[choice.agent] = float(observation[VISIBLE_SHARE][0])
+        losers = self._losers(actions)
+        pending = set(actions)
+        while pending:
+            agent = min((a for a in simulator.free_agents(0).tolist() if a in pending), key=losers.__contains__)
+            pending.remove(agent)
+            simulator.give_turn(0, agent)
+            simulator.step(np.array([actions[agent]]))
+            rewards[agent] = float(simulator.reward[0])
+            if simulator.conflict[0]:
+                outcomes[agent] = Outcome.CONFLICT
+            if simulator.over[0] or simulator.elapsed[0] > 0:
+                break
+        outcomes.update(dict.fromkeys(pending, Outcome.LAPSED))
+        return [
+            Commit(
+                tick=tick,
+                agent=choice.agent,
+                action=choice.action,
+                outcome=outcomes[choice.agent],
+                reward=rewards[choice.agent],
+                share=shares[choice.agent],
+            )
+            for choice in choices
+        ]
+
+    def _losers(self, actions: dict[int, int]) -> set[int]:
+        """The agents whose action the draw gives to another."""
+        best: dict[int, tuple[float, int]] = {}
+        keys, time = self.simulator.episode_keys, self.simulator.time
+        for agent, action in actions.items():
+            if action != IDLE:
+                bid = (float(uniforms(keys, time, Stream.CONFLICT, np.array([action]), agent)[0]), agent)
+                best[action] = min(best.get(action, bid), bid)
+        return {agent for agent, action in actions.items() if action != IDLE and best[action][1] != agent}

@@ -11,7 +11,6 @@ from marl_sched.comms.decision_log import SCHEMA, Header, Step, play_again, read
 from marl_sched.comms.metrics.report import build_report
 from marl_sched.comms.metrics.run_metrics import RunMetrics
 from marl_sched.comms.options import WorldOptions
-from marl_sched.comms.plant import SimulatedPlant
 from marl_sched.comms.protocol.events import End, Ending
 from marl_sched.errors import InvalidFileError, InvalidOptionError
 
@@ -36,7 +35,7 @@ def replay(path: Path, picture: Path | None = None) -> dict[str, Any]:
     if picture is not None and PICTURE not in domain.render:
         raise InvalidOptionError(f"picture: {domain.name} draws none")
     extra = domain.render_options.get(PICTURE, {}) if picture is not None else {}
-    plant = SimulatedPlant(domain, options.telemetry(), options.simulator(**extra))
+    plant = options.plant(**extra)
     steps = [line for line in lines if isinstance(line, Step)]
     play_again(plant, steps, path)
     if picture is not None:

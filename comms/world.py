@@ -20,7 +20,7 @@ from marl_sched.comms.metrics.report import build_report
 from marl_sched.comms.metrics.run_metrics import RunMetrics
 from marl_sched.comms.metrics.throttle import ThrottledLog
 from marl_sched.comms.options import WorldOptions
-from marl_sched.comms.plant import Plant, SimulatedPlant
+from marl_sched.comms.plant import Plant
 from marl_sched.comms.process import interruptible, run_process
 from marl_sched.comms.protocol import events as ev
 from marl_sched.comms.protocol import keys
@@ -55,7 +55,7 @@ class World:
         """`plant`: the domain's simulator unless given, at its start or, with a log, where that ends."""
         self.options, self.transport, self.metrics, self._clock = options, transport, RunMetrics(), clock
         self.domain, self.telemetry = options.domain(), options.telemetry()
-        self.plant: Plant = plant or SimulatedPlant(self.domain, self.telemetry, options.simulator())
+        self.plant: Plant = plant or options.plant()
         self.epoch = f"{time.time_ns():x}-{os.getpid():x}"
         self.commits = commits if commits is not None else MemoryLog()
         resumed = isinstance(self.commits, FileLog) and self.commits.resumed

@@ -40,6 +40,7 @@ class Outcome(StrEnum):
     ILLEGAL = "illegal"  # impossible in the agent's view
     LATE = "late"  # no answer in time
     ABSENT = "absent"  # nobody there to ask
+    LAPSED = "lapsed"  # another choice of the same epoch ended it before
 
 
 # ---- events

@@ -52,6 +52,10 @@ class Plant:
     objective: options.Objective = None
     view: options.View = "full"
     run: Annotated[str, typer.Option("--run", help="The run's name, by which its processes find each other.")] = "run"
+    conflict: Annotated[
+        str,
+        typer.Option("--conflict", help="turns (agents decide in turn) or priority (all at once, settled by a draw)."),
+    ] = "turns"
     clock: Annotated[
         str, typer.Option("--clock", help="Who owns time: lockstep (waits for missing agents), paced, or free.")
     ] = "lockstep"
@@ -111,6 +115,7 @@ class Plant:
             view_options=asdict(problem.view),
             run=self.run,
             listen=listen,
+            conflict=self.conflict,  # type: ignore[arg-type]  # WorldOptions refuses other words
             clock=self.clock,  # type: ignore[arg-type]  # WorldOptions refuses other words
             pace=self.pace,
             deadline=self.deadline,

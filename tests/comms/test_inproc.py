@@ -8,6 +8,8 @@ import msgspec
 import numpy as np
 import pytest
 
+from marl_sched import airme_v0
+from marl_sched.agents.registry import create_scheduler
 from marl_sched.comms.decision_log import SCHEMA, FileLog, Header, MemoryLog, Step, play_again, read_log
 from marl_sched.comms.fork_server import warm_up
 from marl_sched.comms.inproc import Threads, play
@@ -228,3 +230,34 @@ def test_replay_of_a_log_that_ends_early_says_where(tmp_path):
     assert again["ending"]["kind"] == "failed"
     assert again["ending"]["reason"] == f"the log ends at hour {again['time']}"
     assert len(again["decisions"]) == 9
+
+
+@pytest.mark.parametrize("policy", ["random", "condition"])
+@pytest.mark.parametrize("view", [LOCAL, {"view": "full", "view_options": {}}])
+def test_simultaneous_run_equals_the_parallel_api(view, policy):
+    given = options(conflict="priority", **view)
+    report = play(given, [policy] * 7)
+    env = airme_v0.parallel_env(
+        scale="small", split="test", horizon=60, view={"kind": given.view, **given.view_options}
+    )
+    env.reset(seed=0, options={"instance": given.load_instance()})
+    schedulers = {agent: create_scheduler(policy, "airme") for agent in env.agents}
+    expected, rewards = [], []
+    while env.agents:
+        simulator = env.unwrapped.simulator
+        free, hour = simulator.free_agents(0).tolist(), int(simulator.time[0])
+        actions = {}
+        for i in free:
+            seen = {name: array.copy() for name, array in simulator.observe(np.array([i])).items()}
+            noise = simulator.policy_noise(np.array([i]))
+            actions[f"crew_{i}"] = int(schedulers[f"crew_{i}"].choose(seen, noise)[0])
+        _, reward, _, _, infos = env.step(actions)
+        rewards.append(next(iter(reward.values())))
+        for i in free:
+            outcome = "conflict" if infos[f"crew_{i}"]["conflict"] else "decided"
+            expected.append({"hour": hour, "agent": f"crew_{i}", "action": actions[f"crew_{i}"], "outcome": outcome})
+    assert report["decisions"] == expected
+    assert [reward for reward in report["rewards"] if reward] == [reward for reward in rewards if reward]
+    assert report["ending"]["kind"] == "complete"
+    if policy == "random":
+        assert "conflict" in {decision["outcome"] for decision in expected}
