@@ -210,6 +210,8 @@ class SegmentCollector:
             raise InvalidOptionError("collect: expected the policy with which the collector began")
         self._synchronise(self._module)
         data = next(self._batches)
+        if data.dim() == 3:  # Ray's workers side by side
+            data = data.flatten(0, 1)
         done = data["next", "done"].squeeze(-1).T
         boundary = done.clone()
         boundary[-1] = True
@@ -323,7 +325,8 @@ class RayCollector(WorkerCollector):
             raise MarlSchedError(
                 "collector=ray: expected ray to be installed: pip install 'marl-sched[cluster]'"
             ) from error
-        return TorchRLRay(self._factories(), actor(module), sync=True, **self._options())
+        options = {**self._options(), "total_frames": _NO_LIMIT**2}  # it takes -1 for none at all
+        return TorchRLRay(self._factories(), actor(module), sync=True, **options)
 
 
 def segment_collector(task: TrainingTask, name: CollectorName, workers: int) -> SegmentCollector:

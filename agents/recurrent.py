@@ -1,0 +1,91 @@
+"""Schedulers that remember: what an agent carries from one of its decisions to the next.
+
+An agent's memory is a row of float32 numbers. It is `initial_memory` at the start of an episode, goes into every one of
+the agent's decisions and comes out of it changed, and no other agent reads it. In a simulator the scheduler keeps the
+memories of all agents; an agent that runs by itself keeps its own (`RememberingAgent`), and begins with the initial one
+when it is started again.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+
+import numpy as np
+
+from marl_sched.agents.base import Scheduler
+from marl_sched.errors import InvalidOptionError
+from marl_sched.graph import ACTION_MASK
+from marl_sched.simulation import TurnSimulator
+
+Observation = Mapping[str, np.ndarray]
+
+
+class RecurrentScheduler(Scheduler):
+    """Decides from an agent's observation, its memory and one uniform.
+
+    Attributes:
+        memory_size: numbers that an agent remembers.
+    """
+
+    memory_size: int
+    _memories: np.ndarray | None = None  # float32 (B, max_agents, memory_size)
+
+    def initial_memory(self, batch: int) -> np.ndarray:
+        """The memories of `batch` agents before their first decisions, float32 (batch, memory_size)."""
+        return np.zeros((batch, self.memory_size), np.float32)
+
+    @abstractmethod
+    def choose_recurrent(
+        self, observation: Observation, memory: np.ndarray, uniform: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Actions int64 (B,) and new memories float32 (B, memory_size).
+
+        From batched observations, memories float32 (B, memory_size) and uniforms float64 (B,) in [0, 1).
+        """
+
+    def start(self, simulator: TurnSimulator, rows: np.ndarray) -> None:
+        """Give the agents of `rows`, bool (B,), their initial memories."""
+        shape = (simulator.batch, simulator.max_agents, self.memory_size)
+        if self._memories is None or self._memories.shape != shape:
+            self._memories = np.zeros(shape, np.float32)
+        initial = self.initial_memory(int(rows.sum()) * simulator.max_agents)
+        self._memories[rows] = initial.reshape(-1, simulator.max_agents, self.memory_size)
+
+    def decide(self, simulator: TurnSimulator) -> np.ndarray:
+        """Observe for every acting agent under the simulator's view, choose, and keep what it remembers."""
+        if self._memories is None:
+            raise InvalidOptionError(f"{self.name}: expected start(simulator, rows) before the first decision")
+        rows, observation = simulator.observe_acting()
+        actions = np.zeros(simulator.batch, np.int64)
+        if len(rows):
+            agents = simulator.acting[rows]
+            uniform = simulator.policy_noise(simulator.acting)[rows]
+            actions[rows], memory = self.choose_recurrent(observation, self._memories[rows, agents], uniform)
+            self._memories[rows, agents] = memory
+        return actions
+
+
+class RememberingAgent:
+    """One agent that decides by itself, with its own memory; equal, bit for bit, to that agent in a simulator.
+
+    Args:
+        scheduler: what it decides by.
+    """
+
+    def __init__(self, scheduler: RecurrentScheduler) -> None:
+        self._scheduler = scheduler
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything, as at the start of an episode."""
+        self.memory = self._scheduler.initial_memory(1)
+
+    def act(self, observation: Observation, uniform: float = 0.0) -> int:
+        """The agent's choice from its own observation without batch axis, as PettingZoo gives it."""
+        flat: dict[str, np.ndarray] = dict(observation.get("observation", observation))
+        if ACTION_MASK not in flat:
+            flat[ACTION_MASK] = observation[ACTION_MASK]
+        batched = {name: np.asarray(value)[None] for name, value in flat.items()}
+        actions, self.memory = self._scheduler.choose_recurrent(batched, self.memory, np.array([uniform]))
+        return int(actions[0])
