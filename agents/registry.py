@@ -108,7 +108,7 @@ def load_policy(name_or_path: str | Path, *, mode: Mode | None = None, graph: Gr
         if error.name not in ("torch", "safetensors"):
             raise
         raise MarlSchedError(
-            f"policy {name_or_path}: expected {error.name} to be installed: pip install 'marl-sched[train]'"
+            f"policy {name_or_path}: expected {error.name} to be installed: pip install 'marl-sched[policies]'"
         ) from error
     return NetworkPolicy.load(path, mode=mode, graph=graph)
 
