@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from marl_sched.comms.protocol.keys import run_prefix
 from marl_sched.comms.protocol.rules import ClockKind, WorldRules
+from marl_sched.comms.transport.endpoints import is_loopback
 from marl_sched.domain import Domain, Telemetry, get_domain
 from marl_sched.errors import InvalidOptionError, require
 
@@ -35,6 +36,8 @@ class WorldOptions:
         view, view_options: what agents see.
         run: the run's name, part of every key.
         listen: endpoint, port 0 takes a free one.
+        insecure: whether to listen where other machines reach it, although nothing is encrypted and whoever connects
+            can read turns and answer in an agent's name.
         conflict: `turns`: free agents decide in turn and see each other's choices as their view allows; `priority`: all
             free agents choose at once, and a draw settles who gets what several chose, as in the Parallel API.
         clock: who owns time: `lockstep`, `paced` or `free`; see WorldRules.
@@ -65,6 +68,7 @@ class WorldOptions:
     view_options: Mapping[str, int | float] = field(default_factory=dict)
     run: str = "run"
     listen: str = DEFAULT_ENDPOINT
+    insecure: bool = False
     conflict: Conflict = "turns"
     clock: ClockKind = "lockstep"
     pace: float = 1.0
@@ -83,6 +87,11 @@ class WorldOptions:
     def __post_init__(self) -> None:
         """Refuse what cannot be run."""
         run_prefix(self.run)
+        if not self.insecure and not is_loopback(self.listen):
+            raise InvalidOptionError(
+                f"listen: {self.listen} is reached by other machines, and nothing is encrypted: whoever connects can "
+                "answer in an agent's name. Say --insecure (insecure: true) if nobody but yours can connect"
+            )
         require("conflict", self.conflict, get_args(Conflict))
         require("clock", self.clock, get_args(ClockKind))
         require("sync", self.sync, get_args(Sync))

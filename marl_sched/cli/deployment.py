@@ -52,6 +52,9 @@ class Plant:
     objective: options.Objective = None
     view: options.View = "full"
     run: Annotated[str, typer.Option("--run", help="The run's name, by which its processes find each other.")] = "run"
+    insecure: Annotated[
+        bool, typer.Option("--insecure", help="Listen where other machines reach it; nothing is encrypted.")
+    ] = False
     conflict: Annotated[
         str,
         typer.Option("--conflict", help="turns (agents decide in turn) or priority (all at once, settled by a draw)."),
@@ -115,6 +118,7 @@ class Plant:
             view_options=asdict(problem.view),
             run=self.run,
             listen=listen,
+            insecure=self.insecure,
             conflict=self.conflict,  # type: ignore[arg-type]  # WorldOptions refuses other words
             clock=self.clock,  # type: ignore[arg-type]  # WorldOptions refuses other words
             pace=self.pace,

@@ -261,3 +261,10 @@ def test_simultaneous_run_equals_the_parallel_api(view, policy):
     assert report["ending"]["kind"] == "complete"
     if policy == "random":
         assert "conflict" in {decision["outcome"] for decision in expected}
+
+
+@pytest.mark.parametrize("endpoint", ["tcp/0.0.0.0:7447", "tcp/plant.example:7447", "tcp/[::]:7447"])
+def test_endpoint_that_other_machines_reach_is_refused_unless_asked_for(endpoint):
+    with pytest.raises(InvalidOptionError, match="is reached by other machines"):
+        options(listen=endpoint)
+    assert options(listen=endpoint, insecure=True).listen == endpoint
