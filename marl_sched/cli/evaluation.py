@@ -53,12 +53,14 @@ def compare(
     """As evaluate, and draw the scores, an episode of every scheduler and the learning curves of training logs."""
     from marl_sched.cli.tables import FORMATS, print_scores
     from marl_sched.domain import get_domain
-    from marl_sched.errors import require
+    from marl_sched.errors import InvalidOptionError, require
     from marl_sched.files import STDOUT, write_json
     from marl_sched.train.evaluation.compare import draw_learning_curves, draw_scores, draw_timelines, play_episode
 
     options.check_folder(out)
     options.check_output(json)
+    if json is not None and json.absolute() == out.absolute():
+        raise InvalidOptionError(f"--json: {json} is the folder of --out, expected a file")
     require("format", format, FORMATS)
     if log:  # first, as a log may be malformed
         better = get_domain(selection.env).better

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from marl_sched.cli.tables import FORMATS, print_scores
-from marl_sched.errors import UnknownNameError
+from marl_sched.errors import InvalidOptionError, UnknownNameError
 
 
 def summary(mean):
@@ -119,3 +119,15 @@ def test_a_dash_gives_standard_output_to_the_json_alone():
     done = evaluate("--json", "-")
     assert json.loads(done.stdout) == results()
     assert b"0.7123" in done.stderr
+
+
+def test_one_path_for_folder_and_file_is_refused_before_anything_is_played(tmp_path):
+    from typer.testing import CliRunner
+
+    from marl_sched.cli.app import app
+
+    both = str(tmp_path / "d")
+    command = ["compare", "--env", "airme", "--schedulers", "random", "--out", both, "--json", both]
+    with pytest.raises(InvalidOptionError, match="is the folder of --out, expected a file"):
+        CliRunner().invoke(app, command, catch_exceptions=False, standalone_mode=False)
+    assert list(tmp_path.iterdir()) == []
