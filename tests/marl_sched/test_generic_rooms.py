@@ -11,7 +11,7 @@ from marl_sched.envs import DOMAINS
 ROOT = Path(__file__).resolve().parents[2]
 GENERIC = ("marl_sched", "envs/api", "train", "comms")
 # Public modules of one domain, and the files that register it.
-REGISTRATION = {"marl_sched/__init__.py", "marl_sched/gymnasium_ids.py"}
+REGISTRATION = {"marl_sched/__init__.py", "marl_sched/gymnasium_ids.py", "marl_sched/pettingzoo_ids.py"}
 FILES = sorted(
     path
     for room in GENERIC
