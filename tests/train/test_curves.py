@@ -46,7 +46,7 @@ def test_a_mean_over_simulated_hours_reads_between_the_points_of_a_run(tmp_path:
         made_up(tmp_path / "a", scores=[0.1, 0.2, 0.3, 0.4]),
         made_up(tmp_path / "b", scores=[0.5, 0.5, 0.5], every=15),
     ]
-    mean = learning_curves(runs, x="hours", smooth=1)["groups"]["gae"]["mean"]
+    mean = learning_curves(runs, x="time", smooth=1)["groups"]["gae"]["mean"]
     assert mean["x"] == [15, 30]
     assert mean["y"] == pytest.approx([(0.15 + 0.5) / 2, (0.3 + 0.5) / 2])
 
@@ -80,9 +80,9 @@ def test_a_picture_has_a_thin_line_for_each_run_and_a_thick_one_for_each_group(t
 
 def test_the_command_writes_the_picture_and_its_numbers(tmp_path: Path):
     run = made_up(tmp_path / "run", scores=[0.1, 0.2])
-    assert run_command(["curves", str(run), "--out", str(tmp_path / "curves.png"), "--x", "hours"]) == 0
+    assert run_command(["curves", str(run), "--out", str(tmp_path / "curves.png"), "--x", "time"]) == 0
     assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
-    assert read_json(tmp_path / "curves.json") == learning_curves([run], x="hours")
+    assert read_json(tmp_path / "curves.json") == learning_curves([run], x="time")
 
 
 def test_what_cannot_be_drawn_is_refused_by_name(tmp_path: Path):
