@@ -7,12 +7,14 @@ dissertation linearises the same problem for a MILP solver; intervals need no bi
 
 from __future__ import annotations
 
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from marl_sched.agents.murse.problem import Plan, Round
+from marl_sched.agents.murse.problem import Plan, Round, plan_cost
 from marl_sched.envs.murse.instance import NO_DEADLINE
 from marl_sched.envs.murse.timetable import longest_round
 from marl_sched.errors import InvalidOptionError, MarlSchedError, require
@@ -21,74 +23,141 @@ if TYPE_CHECKING:
     from ortools.sat.python import cp_model
 
 OBJECTIVES = ("makespan", "weighted")
+_STOPPING_SECONDS = 0.01  # between two requests to stop
 _WEIGHT_UNIT = 1000  # CP-SAT counts in integers; weights are rounded to thousandths
+
+
+WORK_LIMIT = 10.0
+"""Deterministic seconds of a run: CP-SAT's count of its work, about a second of one core each, whatever else runs."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Solution:
-    """What the solver found.
+    """What the solver found, and under which limits.
 
     Attributes:
         plan: the best schedule, None if none was found.
-        status: "optimal", "feasible", "infeasible" (proved) or "unknown" (the time was up).
+        status: "optimal", "feasible", "infeasible" (proved) or "unknown" (a limit came first).
         objective: of the plan; nan without one.
         bound: no schedule is better than this; nan if infeasible.
-        seconds: time spent.
+        improved: whether the plan is better than the one that the solver started from.
+        seconds: wall time spent.
+        work: deterministic seconds spent.
+        work_limit, time_limit: limits of the two, None for no limit.
+        threads: number of threads.
     """
 
     plan: Plan | None
     status: str
     objective: float
     bound: float
+    improved: bool
     seconds: float
+    work: float
+    work_limit: float | None
+    time_limit: float | None
+    threads: int
 
     @property
     def gap(self) -> float:
         """(objective - bound) / objective, 0 for a proved optimum; nan without a plan."""
         return (self.objective - self.bound) / self.objective if self.objective else 0.0
 
+    @property
+    def timed_out(self) -> bool:
+        """Whether a limit ended the run before it had proved anything."""
+        return self.status in ("feasible", "unknown")
 
-def solve(problem: Round, *, objective: str = "makespan", time_limit: float = 10.0, seed: int = 0) -> Solution:
-    """Minimise the makespan or the weighted completion time within `time_limit` seconds on one thread.
 
-    A run that ends before its time limit is the same every time. Raises UnknownNameError or InvalidOptionError
-    for options outside their domain, MarlSchedError without OR-Tools.
+def solve(
+    problem: Round,
+    *,
+    objective: str = "makespan",
+    work_limit: float | None = None,
+    time_limit: float | None = None,
+    threads: int = 1,
+    seed: int = 0,
+    start: Plan | None = None,
+) -> Solution:
+    """Minimise the makespan or the weighted completion time within the limits, whichever comes first.
+
+    Without any limit WORK_LIMIT holds. With one thread and without a `time_limit`, in wall seconds, the outcome is the
+    same every time, under load as well. `start` is a
+    plan of the same problem: where it is feasible the solver begins there, and what it returns is never worse.
+    Ctrl-C ends the run with KeyboardInterrupt. Raises UnknownNameError or InvalidOptionError for options outside
+    their domain, MarlSchedError without OR-Tools.
     """
     require("objective of murse", objective, OBJECTIVES)
-    if not time_limit > 0:
-        raise InvalidOptionError(f"exact: time_limit: expected seconds > 0, got {time_limit}")
+    require_limits("exact", work_limit, time_limit, threads)
+    if work_limit is None and time_limit is None:
+        work_limit = WORK_LIMIT
     cp = ortools()
-    model = _Model(cp, problem)
+    start = start if start is not None and start.feasible else None
+    model = _Model(cp, problem, start if objective == "makespan" else None)
     model.minimise(objective)
+    if start is not None:
+        model.hint(start)
     solver = cp.CpSolver()
-    solver.parameters.max_time_in_seconds = time_limit
-    solver.parameters.num_workers = 1
+    solver.parameters.num_workers = threads
     solver.parameters.random_seed = seed
-    status = solver.solve(model.model)
-    seconds = float(solver.wall_time)
-    if status == cp.INFEASIBLE:
-        return Solution(plan=None, status="infeasible", objective=np.nan, bound=np.nan, seconds=seconds)
-    unit = _WEIGHT_UNIT if objective == "weighted" else 1
-    bound = float(solver.best_objective_bound) / unit
-    if status not in (cp.OPTIMAL, cp.FEASIBLE):
-        return Solution(plan=None, status="unknown", objective=np.nan, bound=bound, seconds=seconds)
-    return Solution(
-        plan=model.plan(solver),
-        status="optimal" if status == cp.OPTIMAL else "feasible",
-        objective=float(solver.objective_value) / unit,
-        bound=bound,
-        seconds=seconds,
+    if work_limit is not None:
+        solver.parameters.max_deterministic_time = work_limit
+    if time_limit is not None:
+        solver.parameters.max_time_in_seconds = time_limit
+    status = _run(solver, model.model)
+    plan = model.plan(solver) if status in (cp.OPTIMAL, cp.FEASIBLE) else None
+    better = plan is not None and (
+        start is None or plan_cost(problem, plan, objective) < plan_cost(problem, start, objective)
     )
+    plan = plan if better else start
+    unit = _WEIGHT_UNIT if objective == "weighted" else 1
+    words = {cp.OPTIMAL: "optimal", cp.INFEASIBLE: "infeasible"}
+    return Solution(
+        plan=plan,
+        status=words.get(status, "unknown" if plan is None else "feasible"),
+        objective=np.nan if plan is None else plan_cost(problem, plan, objective)[1],
+        bound=np.nan if status == cp.INFEASIBLE else float(solver.best_objective_bound) / unit,
+        improved=better,
+        seconds=float(solver.wall_time),
+        work=float(solver.deterministic_time),
+        work_limit=work_limit,
+        time_limit=time_limit,
+        threads=threads,
+    )
+
+
+def require_limits(name: str, work_limit: float | None, time_limit: float | None, threads: int) -> None:
+    """Raise InvalidOptionError unless the limits that are given are positive, and threads at least one."""
+    for option, limit in (("work_limit", work_limit), ("time_limit", time_limit)):
+        if limit is not None and not limit > 0:
+            raise InvalidOptionError(f"{name}: {option}: expected seconds > 0, got {limit}")
+    if threads < 1:
+        raise InvalidOptionError(f"{name}: threads: expected an integer >= 1, got {threads}")
+
+
+def _run(solver: Any, model: Any) -> Any:
+    """The status of a run in a thread of its own: the main thread stays free to take Ctrl-C, and then ends the run."""
+    solver.parameters.catch_sigint_signal = False
+    with ThreadPoolExecutor(1) as pool:
+        running = pool.submit(solver.solve, model)
+        try:
+            return running.result()
+        except BaseException:
+            while not running.done():  # a run that has not begun yet cannot be stopped
+                solver.stop_search()
+                time.sleep(_STOPPING_SECONDS)
+            raise
 
 
 class _Model:
     """The constraint model of one round, and the way back from its solution to a plan."""
 
-    def __init__(self, cp: Any, problem: Round) -> None:
+    def __init__(self, cp: Any, problem: Round, within: Plan | None) -> None:
         self.problem = problem
         self.model: cp_model.CpModel = cp.CpModel()
         release = int(max(problem.ready.max(), problem.fixed.max(), 0))
-        self.horizon = release + int(longest_round(problem.durations, problem.lags))
+        longest = release + int(longest_round(problem.durations, problem.lags))
+        self.horizon = longest if within is None else within.makespan
         self.starts = [self._start(i) for i in range(problem.n_tasks)]
         self.ends: list[Any] = []
         self.taken: dict[tuple[int, int], Any] = {}
@@ -143,6 +212,15 @@ class _Model:
         length = self.model.new_int_var(0, longest, f"length {i + 1}")
         self.model.add(length == self.ends[i] - self.starts[i])
         return length
+
+    def hint(self, plan: Plan) -> None:
+        """Let the solver begin with a feasible plan."""
+        for i in range(self.problem.n_tasks):
+            self.model.add_hint(self.starts[i], int(plan.starts[i]))
+            self.model.add_hint(self.ends[i], int(plan.finishes[i]))
+        doers = dict(zip(plan.tasks.tolist(), plan.agents.tolist(), strict=True))
+        for (i, agent), taken in self.taken.items():
+            self.model.add_hint(taken, int(doers[i] == agent))
 
     def minimise(self, objective: str) -> None:
         """Set what is minimised."""

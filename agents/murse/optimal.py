@@ -4,85 +4,132 @@ from __future__ import annotations
 
 import numpy as np
 
-from marl_sched.agents.murse.exact import Solution, solve
+from marl_sched.agents.murse.best_rule import best_rule_plan
+from marl_sched.agents.murse.exact import WORK_LIMIT, Solution, require_limits, solve
 from marl_sched.agents.murse.following import PlanningScheduler
-from marl_sched.agents.murse.list_schedule import edf_priority, edf_schedule, list_schedule
 from marl_sched.agents.murse.problem import Plan, Round, timed
-from marl_sched.agents.murse.snapshot import estimated_round, remaining_round
+from marl_sched.agents.murse.snapshot import as_expected, estimated_round, remaining_round
 from marl_sched.envs.murse.instance import MurseInstance
 from marl_sched.envs.murse.simulator import MurseSimulator
 from marl_sched.errors import InvalidOptionError
 from marl_sched.simulation import TurnSimulator
 
-_TIME_LIMIT = 10.0  # seconds per round
-_ROLLING_TIME_LIMIT = 2.0  # seconds per new plan
+_ROLLING_WORK_LIMIT = 2.0  # deterministic seconds per new plan
+SOLVER_MEASURES = ("bound", "optimal", "timed_out", "without_plan", "solver_seconds")
 
 
 class ExactScheduler(PlanningScheduler):
-    """Solves every round on estimated durations with CP-SAT and follows the solution.
+    """Solves every round on estimated durations with CP-SAT, from the best rule's plan on, and follows the solution.
 
-    A round for which the solver finds no feasible plan, because there is none or because `time_limit` seconds were
-    not enough, is played by EDF; `solutions` says which.
+    Without limits a run gets WORK_LIMIT deterministic seconds; `time_limit` is in wall seconds. A round for which
+    neither the solver nor a rule has a feasible plan is played by the best rule's plan, and counted as
+    `without_plan`. The per-round measures of SOLVER_MEASURES say what the solver was worth.
 
     Attributes:
-        solutions: (row, round) -> what the solver found, of the running episodes.
+        solutions: (row, round) -> what the solver found last, of the running episodes.
     """
 
     name = "exact"
+    default_work_limit = WORK_LIMIT
 
-    def __init__(self, time_limit: float = _TIME_LIMIT) -> None:
+    def __init__(self, time_limit: float | None = None, work_limit: float | None = None, threads: int = 1) -> None:
         super().__init__()
-        if not time_limit > 0:
-            raise InvalidOptionError(f"{self.name}: time_limit: expected seconds > 0, got {time_limit}")
-        self._time_limit = time_limit
+        require_limits(self.name, work_limit, time_limit, threads)
+        if time_limit is None and work_limit is None:
+            work_limit = self.default_work_limit
+        self._limits = {"time_limit": time_limit, "work_limit": work_limit, "threads": threads}
         self.solutions: dict[tuple[int, int], Solution] = {}
+        self._measures = {name: np.zeros((0, 0)) for name in SOLVER_MEASURES}
 
     def start(self, simulator: TurnSimulator, rows: np.ndarray) -> None:
-        """Forget the rows' plans and solutions."""
+        """Forget the plans, solutions and measures of `rows`, bool (B,)."""
         super().start(simulator, rows)
         self.solutions = {
             key: found for key, found in self.solutions.items() if key[0] < len(rows) and not rows[key[0]]
         }
+        shape = (simulator.batch, getattr(simulator, "horizon", 1))
+        for name, values in self._measures.items():
+            if values.shape != shape:
+                self._measures[name] = np.full(shape, np.nan)
+            self._measures[name][rows] = np.nan
+
+    def per_round(self) -> dict[str, np.ndarray]:
+        """SOLVER_MEASURES, float64 (B, rounds), NaN where no round was solved.
+
+        The bound is that of the round's first run; the others are sums over the round's runs, `optimal` too.
+        """
+        return {name: values.copy() for name, values in self._measures.items()}
 
     def plan(self, simulator: MurseSimulator, row: int) -> Plan:
         """The solution of the round on estimates, everything as early as its order allows."""
-        problem = estimated_round(simulator, row)
-        solution = self._solve(simulator, problem)
-        self.solutions[row, int(simulator.state.rows["round"][row])] = solution
-        if solution.plan is None:
-            return edf_schedule(problem)
-        return timed(problem, solution.plan.tasks, solution.plan.agents)
+        problem = self.whole(simulator, row)
+        plan = self._solved(simulator, row, problem)
+        return timed(problem, plan.tasks, plan.agents)
 
-    def _solve(self, simulator: MurseSimulator, problem: Round) -> Solution:
-        return solve(problem, objective=simulator.objective, time_limit=self._time_limit)
+    def whole(self, simulator: MurseSimulator, row: int) -> Round:
+        """The round as the solver is given it at its beginning."""
+        return estimated_round(simulator, row)
+
+    def _solved(self, simulator: MurseSimulator, row: int, problem: Round) -> Plan:
+        first = best_rule_plan(problem, simulator.objective)
+        solution = solve(problem, objective=simulator.objective, start=first, **self._limits)
+        now = int(simulator.state.rows["round"][row])
+        self.solutions[row, now] = solution
+        new = {
+            "bound": solution.bound,
+            "optimal": solution.status == "optimal",
+            "timed_out": solution.timed_out,
+            "without_plan": solution.plan is None,
+            "solver_seconds": solution.seconds,
+        }
+        for name, value in new.items():
+            before = self._measures[name][row, now]
+            if np.isnan(before):
+                self._measures[name][row, now] = value
+            elif name != "bound":
+                self._measures[name][row, now] = before + value
+        return first if solution.plan is None else solution.plan
 
 
 class RollingScheduler(ExactScheduler):
     """Plans again whenever an agent becomes free and something did not end when the plan had it end.
 
-    What is committed to stays, running tasks end at their expected times, the rest is solved anew. While
-    everything goes as planned, an optimal plan remains one and is kept. Where no feasible plan is found, what is
-    left is completed by EDF.
+    What is committed to stays, running tasks end at their expected times, the rest is solved anew, with `margin`
+    standard deviations added to every open task's duration. While everything goes as planned, the plan is kept.
     """
 
     name = "exact-rolling"
+    default_work_limit = _ROLLING_WORK_LIMIT
 
-    def __init__(self, time_limit: float = _ROLLING_TIME_LIMIT) -> None:
-        super().__init__(time_limit)
+    def __init__(
+        self,
+        time_limit: float | None = None,
+        work_limit: float | None = None,
+        threads: int = 1,
+        margin: float = 0.0,
+    ) -> None:
+        super().__init__(time_limit, work_limit, threads)
+        if not 0.0 <= margin < np.inf:
+            raise InvalidOptionError(f"{self.name}: margin: expected a number >= 0, got {margin}")
+        self._margin = margin
+
+    def whole(self, simulator: MurseSimulator, row: int) -> Round:
+        """The round with the margin on every duration."""
+        return estimated_round(simulator, row, self._margin)
 
     def revise(self, simulator: MurseSimulator, row: int, plan: Plan) -> Plan:
         """A plan for what is left of the round."""
-        problem = remaining_round(simulator, row)
-        taken = problem.fixed >= 0
-        finishes = problem.fixed + problem.durations[np.arange(problem.n_tasks), np.maximum(problem.agents, 0)]
-        if np.array_equal(finishes[taken], plan.finishes[taken]):
+        if simulator.mode == "plan":
             return plan
-        solution = self._solve(simulator, problem)
-        if solution.plan is None:
-            return list_schedule(problem, edf_priority(problem.deadlines))
-        return solution.plan
+        problem = remaining_round(simulator, row, self._margin)
+        return plan if as_expected(problem, plan) else self._solved(simulator, row, problem)
 
 
-def is_feasible(instance: MurseInstance, time_limit: float = _TIME_LIMIT) -> bool:
-    """Whether the solver proves the first round feasible, humans at their means; False if the time was up."""
-    return solve(Round.of(instance), time_limit=time_limit).plan is not None
+def is_feasible(instance: MurseInstance, time_limit: float | None = None) -> bool:
+    """Whether a rule or the solver finds a feasible plan of the first round, humans at their means.
+
+    Without a `time_limit` in seconds the solver works for WORK_LIMIT; False if a limit came first.
+    """
+    problem = Round.of(instance)
+    first = best_rule_plan(problem)
+    return first.feasible or solve(problem, time_limit=time_limit).plan is not None

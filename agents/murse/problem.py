@@ -112,3 +112,8 @@ def timed(problem: Round, tasks: np.ndarray, agents: np.ndarray) -> Plan:
         makespan=int(finishes.max()),
         feasible=good and bool(problem.eligible[tasks, agents].all()),
     )
+
+
+def plan_cost(problem: Round, plan: Plan, objective: str) -> tuple[bool, float]:
+    """What schedulers compare plans by: whether infeasible, then the makespan or the weighted completion time."""
+    return not plan.feasible, plan.weighted(problem) if objective == "weighted" else float(plan.makespan)

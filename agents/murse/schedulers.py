@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from marl_sched.agents.base import Scheduler
+from marl_sched.agents.murse.dispatching import factories
 from marl_sched.agents.murse.genetic import GeneticEdf
 from marl_sched.agents.murse.lst import LeastLatestStart, LstSearch, RobustLst
 from marl_sched.agents.murse.negotiated import Cbba, Tessi, TessiSlack
@@ -20,6 +21,7 @@ RULES: dict[str, Callable[..., Scheduler]] = {
     "edf": edf,
     "edf-published": EdfPublished,
     "hctf": hctf,
+    **factories(),
     "lst": LeastLatestStart,
     "lst-robust": RobustLst,
     "lst-search": LstSearch,

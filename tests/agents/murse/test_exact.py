@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import threading
 from itertools import permutations, product
 
 import numpy as np
@@ -9,10 +12,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from marl_sched.agents.murse.exact import solve
+from marl_sched.agents.murse.best_rule import best_rule_plan
+from marl_sched.agents.murse.exact import WORK_LIMIT, solve
 from marl_sched.agents.murse.list_schedule import edf_schedule
 from marl_sched.agents.murse.optimal import ExactScheduler, RollingScheduler, is_feasible
-from marl_sched.agents.murse.problem import Round, timed
+from marl_sched.agents.murse.problem import Round, plan_cost, timed
 from marl_sched.agents.murse.snapshot import remaining_round
 from marl_sched.envs.murse.formats import read_flexible_job_shop, read_job_shop
 from marl_sched.envs.murse.generate import generate
@@ -117,14 +121,92 @@ def test_infeasible_problems_are_said_to_be():
     assert not simulator.round_results(0)["feasible"][0]
 
 
+def test_a_limit_that_comes_first_leaves_a_plan_no_worse_than_the_best_rule_and_is_told():
+    whole = Round.of(generate("large", np.random.default_rng(2)))
+    first = best_rule_plan(whole)
+    solution = solve(whole, work_limit=0.05, start=first)
+    assert first.feasible
+    assert (solution.status, solution.timed_out) == ("feasible", True)
+    assert (solution.work_limit, solution.time_limit, solution.threads) == (0.05, None, 1)
+    assert solution.bound < solution.objective <= first.makespan
+    assert timed(whole, solution.plan.tasks, solution.plan.agents).makespan == solution.objective
+
+
+def test_a_run_on_one_thread_without_a_wall_clock_is_the_same_every_time():
+    whole = Round.of(generate("medium", np.random.default_rng(2)))
+    runs = [solve(whole, work_limit=0.3) for _ in range(2)]
+    assert runs[0].work == runs[1].work
+    assert runs[0].bound == runs[1].bound
+    assert (runs[0].plan is None) == (runs[1].plan is None)
+    assert runs[0].plan is None or np.array_equal(runs[0].plan.starts, runs[1].plan.starts)
+
+
+def test_the_limit_is_one_of_work_unless_another_is_given():
+    whole = Round.of(three_tasks())
+    assert (solve(whole).work_limit, solve(whole).time_limit) == (WORK_LIMIT, None)
+    assert (solve(whole, time_limit=5).work_limit, solve(whole, time_limit=5).time_limit) == (None, 5)
+
+
+@settings(max_examples=40, deadline=None)
+@given(instances(), st.sampled_from(["makespan", "weighted"]))
+def test_a_run_is_never_worse_than_what_it_started_from(instance, objective):
+    whole = Round.of(instance)
+    first = best_rule_plan(whole, objective)
+    solution = solve(whole, objective=objective, start=first)
+    if first.feasible:
+        assert solution.status == "optimal"
+        assert plan_cost(whole, solution.plan, objective) <= plan_cost(whole, first, objective)
+        assert solution.improved == (solution.plan is not first)
+
+
+def test_an_interrupt_ends_the_run():
+    # a large problem without a time limit that could end it; the interrupt comes half a second on
+    whole = Round.of(generate("heterogeneous-10-large", np.random.default_rng(0)))
+    interrupt = threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT))
+    interrupt.start()
+    with pytest.raises(KeyboardInterrupt):
+        solve(whole, time_limit=3600)
+
+
+def test_a_round_without_a_feasible_plan_is_counted_and_solved_ones_tell_their_bounds():
+    scheduler = ExactScheduler()
+    finished(scheduler, [problem([[5], [5]], deadlines=[7, 7]), problem([[5], [5]])], horizon=1)
+    measures = scheduler.per_round()
+    assert measures["without_plan"].tolist() == [[1.0], [0.0]]
+    assert measures["optimal"].tolist() == [[0.0], [1.0]]
+    assert measures["timed_out"].tolist() == [[0.0], [0.0]]
+    assert np.isnan(measures["bound"][0, 0])
+    assert measures["bound"][1, 0] == 10.0
+
+
+def test_a_margin_makes_the_rolling_solver_plan_with_longer_durations():
+    curve = [10.0, 4.0, 0.0, 0.0, 0.0, 0.0]
+    instance = problem([[]] * 2, curves=[[curve]] * 2, durations="stochastic", duration_range=(1, 100))
+    lengths = []
+    for margin in (0.0, 1.0):
+        scheduler = RollingScheduler(margin=margin)
+        simulator = MurseSimulator([instance], mode="online")
+        scheduler.start(simulator, np.ones(1, bool))
+        scheduler.decide(simulator)
+        lengths.append(scheduler.solutions[0, 0].objective)
+    spread = simulator.state.pairs["spread"][0, :2, 0]
+    assert lengths[1] - lengths[0] == np.rint(spread).sum() > 0
+
+
 def test_unknown_objectives_and_times_are_refused():
     whole = Round.of(three_tasks())
     with pytest.raises(UnknownNameError, match="makespn"):
         solve(whole, objective="makespn")
     with pytest.raises(InvalidOptionError, match="time_limit"):
         solve(whole, time_limit=0)
+    with pytest.raises(InvalidOptionError, match="work_limit"):
+        solve(whole, work_limit=0)
+    with pytest.raises(InvalidOptionError, match="threads"):
+        ExactScheduler(threads=0)
     with pytest.raises(InvalidOptionError, match="time_limit"):
         RollingScheduler(time_limit=-1)
+    with pytest.raises(InvalidOptionError, match="margin"):
+        RollingScheduler(margin=-1)
 
 
 @settings(max_examples=30, deadline=None)
