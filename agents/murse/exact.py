@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from marl_sched.agents.murse.problem import Plan, Round, plan_cost
+from marl_sched.agents.murse.problem import Plan, Round, plan_cost, timed
 from marl_sched.envs.murse.instance import NO_DEADLINE
 from marl_sched.envs.murse.timetable import longest_round
 from marl_sched.errors import InvalidOptionError, MarlSchedError, require
@@ -106,6 +106,8 @@ def solve(
         solver.parameters.max_time_in_seconds = time_limit
     status = _run(solver, model.model)
     plan = model.plan(solver) if status in (cp.OPTIMAL, cp.FEASIBLE) else None
+    if plan is not None and not problem.ready.any() and (problem.fixed < 0).all():
+        plan = timed(problem, plan.tasks, plan.agents)  # a run that a limit ended may leave gaps
     better = plan is not None and (
         start is None or plan_cost(problem, plan, objective) < plan_cost(problem, start, objective)
     )
