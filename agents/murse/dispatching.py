@@ -132,14 +132,16 @@ def dispatch_rule(
             n_open += 1
     clock = free_at.min()
     while count < n:
-        for agent in range(m):
+        agent = -1
+        while agent < m - 1:
+            agent += 1
             if free_at[agent] > clock:
                 continue
             best, least = -1, np.inf
             for k in range(n_open):
                 task = open_[k]
                 p = durations[task, agent]
-                if p == 0 or release[task] > clock:
+                if p < 0 or release[task] > clock:
                     continue
                 key = priority(
                     rule, p, due[task], weights[task], release[task], work[task], operations[task], clock, mean
@@ -159,6 +161,8 @@ def dispatch_rule(
                 if ahead[waiting[k]] == 0:
                     open_[n_open] = waiting[k]
                     n_open += 1
+            if free_at[agent] == clock:  # it took no time: everybody may look again
+                agent = -1
         clock = _next_time(clock, free_at, open_, n_open, release)
         if clock == _NEVER:
             break
@@ -172,7 +176,7 @@ def _mean_durations(durations: np.ndarray) -> tuple[np.ndarray, float]:
     for task in range(len(durations)):
         able = 0
         for agent in range(durations.shape[1]):
-            if durations[task, agent] > 0:
+            if durations[task, agent] >= 0:
                 means[task] += durations[task, agent]
                 able += 1
         means[task] /= max(able, 1)

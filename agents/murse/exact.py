@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from marl_sched.agents.murse.problem import Plan, Round, plan_cost, timed
-from marl_sched.envs.murse.instance import NO_DEADLINE
+from marl_sched.envs.murse.instance import NO_DEADLINE, waiting_order
 from marl_sched.envs.murse.timetable import longest_round
 from marl_sched.errors import InvalidOptionError, MarlSchedError, require
 
@@ -241,14 +241,16 @@ class _Model:
             self.model.minimize(sum(int(cost) * end for cost, end in zip(costs, self.ends, strict=True)))
 
     def plan(self, solver: Any) -> Plan:
-        """The solution as an order of dispatch: by start, ties by finish, then by index."""
+        """The solution as an order of dispatch: by start, ties by finish, then what waits after what it waits for."""
         starts = np.array([solver.value(start) for start in self.starts], np.int64)
         finishes = np.array([solver.value(end) for end in self.ends], np.int64)
         agents = np.full(len(starts), -1, np.int64)
         for (i, agent), taken in self.taken.items():
             if solver.boolean_value(taken):
                 agents[i] = agent
-        tasks = np.lexsort((np.arange(len(starts)), finishes, starts))
+        waits = np.argwhere(self.problem.lags >= 0)
+        rank = np.argsort(waiting_order(len(starts), np.pad(waits, ((0, 0), (0, 1)))))
+        tasks = np.lexsort((rank, finishes, starts))
         return Plan(
             tasks=tasks,
             agents=agents[tasks],

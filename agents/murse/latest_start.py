@@ -11,7 +11,7 @@ All functions take plain arrays, so that simulators, searches and learned polici
     keys = latest_starts(durations, lags, deadlines, common_horizon(durations))
     order, agents, starts, finishes = generate(durations, lags, near, keys)
 
-durations int64 (N, A), 0 for ineligible pairs; lags int64 (N, N), [i, j] the time that i waits after j finishes, -1
+durations int64 (N, A), INELIGIBLE where a pair is; lags int64 (N, N), [i, j] the time that i waits after j finishes, -1
 where it need not; near bool (N, N), pairs that must not overlap; deadlines int64 (N,), NO_DEADLINE for none.
 """
 
@@ -41,7 +41,7 @@ def shortest_durations(durations: np.ndarray) -> np.ndarray:
     shortest = np.full(len(durations), _UNREACHED, np.int64)
     for task in range(len(durations)):
         for agent in range(durations.shape[1]):
-            if durations[task, agent] > 0:
+            if durations[task, agent] >= 0:
                 shortest[task] = min(shortest[task], durations[task, agent])
     return shortest
 
@@ -53,7 +53,7 @@ def common_horizon(durations: np.ndarray) -> float:
     for task in range(len(durations)):
         own, able = 0, 0
         for agent in range(durations.shape[1]):
-            if durations[task, agent] > 0:
+            if durations[task, agent] >= 0:
                 own += durations[task, agent]
                 able += 1
         total += own / max(able, 1)
@@ -121,7 +121,7 @@ def _earliest_on(durations: np.ndarray, task: int, release: int, ready: np.ndarr
     best, start, finish = -1, _UNREACHED, _UNREACHED
     for agent in range(len(ready)):
         lasts = durations[task, agent]
-        if lasts > 0:
+        if lasts >= 0:
             begin = max(ready[agent], release)
             if begin + lasts < finish:
                 best, start, finish = agent, begin, begin + lasts

@@ -28,7 +28,7 @@ def preference(durations: np.ndarray, done: np.ndarray, picking: int, agent: int
     count, total, least = 0, 0.0, np.inf
     for task in range(len(durations)):
         duration = durations[task, agent]
-        if duration > 0 and (picking == MEAN_ALL or not done[task]):
+        if duration >= 0 and (picking == MEAN_ALL or not done[task]):
             count += 1
             total += duration
             least = min(least, duration)
@@ -66,7 +66,7 @@ def best_startable(
     """The task of least priority value, float64 (N, A), that `agent` can start at `clock`; -1 if there is none."""
     best = -1
     for task in range(len(durations)):
-        if done[task] or durations[task, agent] == 0:
+        if done[task] or durations[task, agent] < 0:
             continue
         if best >= 0 and priority[task, agent] >= priority[best, agent]:
             continue

@@ -18,7 +18,7 @@ class Round:
     """N tasks and A agents with known durations; all times are integers from the round's beginning.
 
     Attributes:
-        durations: int64 (N, A), 0 where the pair is ineligible.
+        durations: int64 (N, A), INELIGIBLE where the pair is.
         lags: int64 (N, N), [i, j] how long i waits after j finishes, -1 where it need not.
         near: bool (N, N), pairs that must not overlap.
         deadlines: int64 (N,), latest finish, NO_DEADLINE for none.
@@ -64,7 +64,7 @@ class Round:
     @property
     def eligible(self) -> np.ndarray:
         """Bool (N, A)."""
-        return self.durations > 0
+        return self.durations >= 0
 
     @property
     def worst(self) -> int:

@@ -57,14 +57,14 @@ def published_order(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The rule's dispatch order, tasks and agents int64 (K,); K < N where all agents are passed over for good.
 
-    durations int64 (N, A), 0 for ineligible pairs; the other arrays as in `initial_finishes`, near bool (N, N).
+    durations int64 (N, A), INELIGIBLE where a pair is; the other arrays as in `initial_finishes`, near bool (N, N).
     """
     n, m = durations.shape
     shortest = np.full(n, _UNREACHED, np.int64)
     ahead, release, finish = np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n, np.int64)
     for task in range(n):
         for agent in range(m):
-            if durations[task, agent] > 0:
+            if durations[task, agent] >= 0:
                 shortest[task] = min(shortest[task], durations[task, agent])
         for other in range(n):
             ahead[task] += lags[task, other] >= 0
@@ -82,11 +82,11 @@ def published_order(
                 break
             passed[:] = False
             continue
-        lasts = np.where(startable & (durations[:, agent] > 0), durations[:, agent], shortest)
+        lasts = np.where(startable & (durations[:, agent] >= 0), durations[:, agent], shortest)
         consistent, earliest = initial_finishes(lasts, lags, deadlines, horizon)
         task = -1
         for each in range(n):
-            if startable[each] and durations[each, agent] > 0 and (task < 0 or earliest[each] < earliest[task]):
+            if startable[each] and durations[each, agent] >= 0 and (task < 0 or earliest[each] < earliest[task]):
                 task = each
         if not consistent or task < 0:
             passed[agent] = True
@@ -113,7 +113,7 @@ def _first_choice(durations: np.ndarray, done: np.ndarray, free_at: np.ndarray, 
             continue
         total, able = 0.0, 0
         for task in range(len(done)):
-            if not done[task] and durations[task, agent] > 0:
+            if not done[task] and durations[task, agent] >= 0:
                 total += durations[task, agent]
                 able += 1
         mean = total / able if able else np.inf

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from marl_sched.agents.murse.problem import Plan, Round
-from marl_sched.envs.murse.instance import NO_DEADLINE
+from marl_sched.envs.murse.instance import INELIGIBLE, NO_DEADLINE
 from marl_sched.envs.murse.simulator import MurseSimulator
 from marl_sched.envs.murse.state import NOBODY
 from marl_sched.envs.murse.views import believes
@@ -30,7 +30,7 @@ def estimated_round(simulator: MurseSimulator, row: int, margin: float = 0.0) ->
     instance = simulator.instances[row]
     pairs = simulator.state.pairs[row, : instance.n_tasks, : instance.n_agents]
     planned = pairs["planned"] + np.rint(margin * pairs["spread"]).astype(np.int64)
-    return Round.of(instance, np.where(instance.eligible, planned, 0))
+    return Round.of(instance, np.where(instance.eligible, planned, INELIGIBLE))
 
 
 def remaining_round(simulator: MurseSimulator, row: int, margin: float = 0.0) -> Round:

@@ -26,6 +26,7 @@ from marl_sched.agents.murse.lst import keyed_plan, lst_plan
 from marl_sched.agents.murse.problem import Plan, Round, plan_cost
 from marl_sched.agents.murse.snapshot import estimated_round
 from marl_sched.agents.murse.windows import task_windows
+from marl_sched.envs.murse.instance import INELIGIBLE
 from marl_sched.envs.murse.simulator import MurseSimulator
 from marl_sched.errors import InvalidOptionError
 
@@ -95,7 +96,7 @@ def overload(
 
 def _given(problem: Round, doers: np.ndarray) -> Round:
     """The round in which only the given agent, int64 (N,), can do a task."""
-    only = np.zeros_like(problem.durations)
+    only = np.full_like(problem.durations, INELIGIBLE)
     tasks = np.arange(problem.n_tasks)
     only[tasks, doers] = problem.durations[tasks, doers]
     return replace(problem, durations=only)

@@ -86,7 +86,7 @@ def draw_durations(state: State, b: int) -> None:
             pair, base = state.pairs[b, task, agent], state.base[b, task, agent]
             pair.true = base
             pair.spread = 0.0
-            if agent >= row.n_robots and base > 0:
+            if agent >= row.n_robots and base >= 0:
                 curve = state.curves[b, task, agent]
                 if row.stochastic:
                     entity = task * MAX_HUMANS + agent - row.n_robots
@@ -98,7 +98,7 @@ def draw_durations(state: State, b: int) -> None:
                     continue
                 pair.true = whole(mean_duration(curve, pair.repetitions, row.learning), row.low, row.high)
             pair.planned = pair.true
-            pair.mean = pair.true
+            pair.mean = max(pair.true, 0)
 
 
 @kernel
@@ -131,7 +131,7 @@ def preference(state: State, picking: int, b: int, agent: int) -> float:
     count, total, least = 0, 0.0, np.inf
     for task in range(state.rows[b].n_tasks):
         pair = state.pairs[b, task, agent]
-        if pair.true > 0 and (picking == MEAN_ALL or state.tasks[b, task].agent == NOBODY):
+        if pair.true >= 0 and (picking == MEAN_ALL or state.tasks[b, task].agent == NOBODY):
             count += 1
             total += pair.mean
             least = min(least, pair.mean)
@@ -144,7 +144,7 @@ def preference(state: State, picking: int, b: int, agent: int) -> float:
 def dispatchable(state: State, b: int, task: int, agent: int) -> bool:
     """Whether `agent` can commit to `task` now: unscheduled, eligible, and behind all that it waits for."""
     row = state.rows[b]
-    if task < 0 or task >= row.n_tasks or state.tasks[b, task].agent != NOBODY or state.base[b, task, agent] == 0:
+    if task < 0 or task >= row.n_tasks or state.tasks[b, task].agent != NOBODY or state.base[b, task, agent] < 0:
         return False
     return waits_heeded(task, row.n_tasks, state.order[b], row.dispatched, state.lags[b])
 

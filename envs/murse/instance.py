@@ -1,7 +1,7 @@
 """A MuRSE problem: tasks for a team of robots and humans (dissertation, sections 3.2, 4.2.1 and 5.2.1).
 
 Arrays count tasks, agents and waits from 0; files, messages and actions count tasks from 1. Robots come
-before humans. A pair of task and agent is ineligible when the agent's duration for the task is 0.
+before humans. A pair of task and agent whose duration is INELIGIBLE cannot be; a duration of 0 is one like any other.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ from marl_sched.envs.murse.learning import CURVE, LEARNING, C, K, mean_duration,
 from marl_sched.errors import InvalidOptionError
 from marl_sched.files import write_json
 
-SCHEMA = 1
+SCHEMA = 2
 NO_DEADLINE = -1
+INELIGIBLE = -1
 PROXIMITY = ("distance", "location", "none")
 DURATIONS = ("deterministic", "stochastic")
 
@@ -38,7 +39,7 @@ class MurseInstance:
         duration_range: least and greatest whole duration of a human, to which draws are clipped.
     """
 
-    robot_durations: np.ndarray  # int64 (N, R), time units, 0: ineligible
+    robot_durations: np.ndarray  # int64 (N, R), time units, or INELIGIBLE
     curves: np.ndarray  # float64 (N, H, 6), columns as in learning.CURVE, c + k = 0: ineligible
     deadlines: np.ndarray  # int64 (N,), latest finish, NO_DEADLINE: none
     waits: np.ndarray  # int64 (W, 3), sorted rows (i, j, w): task i starts at least w after task j finishes
@@ -102,7 +103,7 @@ class MurseInstance:
     def _value_problem(self) -> str:
         curves = self.curves.reshape(self.n_tasks, -1)
         for name, good, expected in (
-            ("robot_durations", self.robot_durations >= 0, "an integer >= 0 (0: ineligible)"),
+            ("robot_durations", self.robot_durations >= INELIGIBLE, "an integer >= 0, or -1: ineligible"),
             ("curves", np.isfinite(curves) & (curves >= 0), "numbers >= 0"),
             ("deadlines", (self.deadlines >= 0) | (self.deadlines == NO_DEADLINE), "an integer >= 0 or none"),
             ("locations", np.isfinite(self.locations), "finite numbers"),
@@ -152,15 +153,22 @@ class MurseInstance:
     @cached_property
     def eligible(self) -> np.ndarray:
         """Bool (N, A), which agents can do a task at all."""
-        return np.hstack([self.robot_durations > 0, self.curves[:, :, C] + self.curves[:, :, K] > 0])
+        return np.hstack([self.robot_durations >= 0, self.curves[:, :, C] + self.curves[:, :, K] > 0])
 
     @cached_property
     def mean_durations(self) -> np.ndarray:
-        """Int64 (N, A), durations of the first round without noise, 0 for ineligible pairs."""
-        first = np.zeros((self.n_tasks, self.n_humans), np.int64)
+        """Int64 (N, A), durations of the first round without noise, INELIGIBLE for ineligible pairs."""
+        first = np.full((self.n_tasks, self.n_humans), INELIGIBLE, np.int64)
         for i, h in np.argwhere(self.eligible[:, self.n_robots :]):
             first[i, h] = whole(mean_duration(self.curves[i, h], 0, self.learning_code), *self.duration_range)
         return np.hstack([self.robot_durations, first])
+
+    def waits_by_task(self) -> list[list[tuple[int, int]]]:
+        """Per task its waits as (task that it waits for, time), both counted from 0."""
+        ahead: list[list[tuple[int, int]]] = [[] for _ in range(self.n_tasks)]
+        for i, j, w in self.waits.tolist():
+            ahead[i].append((j, w))
+        return ahead
 
     @cached_property
     def lags(self) -> np.ndarray:
@@ -245,12 +253,13 @@ class MurseInstance:
         return {name: getattr(self, name) for name in names} | {"duration_range": list(self.duration_range)}
 
     def _tasks(self) -> list[dict[str, object]]:
+        ahead = self.waits_by_task()
         return [
             {
-                "robots": self.robot_durations[i].tolist(),
+                "robots": [None if d == INELIGIBLE else int(d) for d in self.robot_durations[i]],
                 "humans": [dict(zip(CURVE, curve.tolist(), strict=True)) for curve in self.curves[i]],
                 "deadline": None if self.deadlines[i] == NO_DEADLINE else int(self.deadlines[i]),
-                "waits": [{"after": int(j) + 1, "time": int(w)} for k, j, w in self.waits if k == i],
+                "waits": [{"after": j + 1, "time": w} for j, w in ahead[i]],
                 "location": self.locations[i].tolist(),
                 "weight": float(self.weights[i]),
             }
@@ -270,13 +279,25 @@ _ARRAYS: dict[str, type] = {
 
 def waiting_order(n_tasks: int, waits: np.ndarray) -> list[int]:
     """The tasks, those that others wait for first; tasks on a cycle of waits, and those behind one, are missing."""
-    ahead = [{int(j) for k, j, _ in waits if k == i} for i in range(n_tasks)]
+    behind: list[set[int]] = [set() for _ in range(n_tasks)]
+    for i, j, _ in waits.tolist():
+        behind[j].add(i)
+    left = [0] * n_tasks
+    for others in behind:
+        for i in others:
+            left[i] += 1
     order: list[int] = []
-    while True:
-        ready = [i for i in range(n_tasks) if i not in order and ahead[i] <= set(order)]
-        if not ready:
-            return order
+    ready = [i for i in range(n_tasks) if left[i] == 0]
+    while ready:
         order += ready
+        freed = set()
+        for j in ready:
+            for i in behind[j]:
+                left[i] -= 1
+                if left[i] == 0:
+                    freed.add(i)
+        ready = sorted(freed)
+    return order
 
 
 def find_cycle(n_tasks: int, waits: np.ndarray) -> list[int]:

@@ -179,7 +179,7 @@ def see_tasks(state: State, b: int, viewer: int, sight: Sight, out: Arrays) -> n
             earliest = earliest_start(task, row.clock, taken, count, lags, near, sight.finish) - row.clock
             features[UNSCHEDULED] = 1.0
             features[EARLIEST_START] = earliest / row.high
-            if pairs[viewer].true > 0:
+            if pairs[viewer].true >= 0:
                 features[EARLIEST_FINISH] = (earliest + pairs[viewer].planned) / row.high
     out.visible_share[b] = visible / n
     return startable
@@ -199,7 +199,7 @@ def describe_task(features: np.ndarray, job: Record, unit: int, now: int, x: flo
 def describe_durations(features: np.ndarray, pairs: np.ndarray, viewer: int, heard: np.ndarray, unit: int) -> None:
     """Estimates for the viewer, and their statistics over the eligible agents within hearing (section 4.3.1)."""
     own = pairs[viewer]
-    features[ELIGIBLE] = own.true > 0
+    features[ELIGIBLE] = own.true >= 0
     features[MY_DURATION] = own.mean / unit
     features[MY_SPREAD] = own.spread / unit
     features[MY_REPETITIONS] = own.repetitions / 10
@@ -254,7 +254,7 @@ def see_durations(state: State, b: int, sight: Sight, out: Arrays) -> None:
             continue
         for agent in range(row.n_agents):
             pair = state.pairs[b, task, agent]
-            if sight.heard[agent] and pair.true > 0:
+            if sight.heard[agent] and pair.true >= 0:
                 mean, spread = pair.mean / row.high, pair.spread / row.high
                 out.take_time[b, agent, task + 1] = 1
                 out.take_time_attributes[b, agent, task + 1, 0] = mean
@@ -329,9 +329,9 @@ def visible_bounds(
         least, most = NEVER, 0
         for agent in range(pairs.shape[1]):
             planned = pairs[task, agent].planned
-            if sight.heard[agent] and planned > 0:
+            if sight.heard[agent] and planned >= 0:
                 least, most = min(least, planned), max(most, planned)
-        durations[i] = least if most > 0 else 0
+        durations[i] = least if least < NEVER else 0
         if sight.known[task]:
             durations[i] = sight.finish[task] - sight.start[task]
             owners[i] = tasks[task].agent

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 import numpy as np
 
-from marl_sched.envs.murse.instance import NO_DEADLINE, SCHEMA, MurseInstance
+from marl_sched.envs.murse.instance import INELIGIBLE, NO_DEADLINE, MurseInstance
 from marl_sched.envs.murse.learning import CURVE
 from marl_sched.errors import InvalidFileError, InvalidOptionError
 from marl_sched.files import read_json
@@ -35,7 +35,7 @@ class _Wait(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class _Task(msgspec.Struct, forbid_unknown_fields=True):
-    robots: list[_Natural]
+    robots: list[_Natural | None]
     humans: list[_Curve]
     location: tuple[float, float]
     deadline: _Natural | None = None
@@ -44,7 +44,7 @@ class _Task(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class _File(msgspec.Struct, forbid_unknown_fields=True):
-    schema: Annotated[Literal[1], msgspec.Meta(description=f"{SCHEMA}")]
+    schema: Annotated[Literal[1, 2], msgspec.Meta(description="1 or 2")]
     env: Literal["murse"]
     n_robots: _Natural
     n_humans: _Natural
@@ -76,11 +76,18 @@ def decode(data: Any, where: str | Path) -> MurseInstance:
         raise InvalidFileError(where, "", f"a possible problem ({error})") from error
 
 
+def _duration(schema: int, written: int | None) -> int:
+    """A robot's duration: null is ineligible, and in files of schema 1 also 0."""
+    return INELIGIBLE if written is None or (schema == 1 and written == 0) else written
+
+
 def _instance(file: _File) -> MurseInstance:
     tasks, n = file.tasks, len(file.tasks)
     curves = [[[getattr(curve, name) for name in CURVE] for curve in task.humans] for task in tasks]
     return MurseInstance(
-        robot_durations=np.array([task.robots for task in tasks], np.int64).reshape(n, file.n_robots),
+        robot_durations=np.array(
+            [[_duration(file.schema, d) for d in task.robots] for task in tasks], np.int64
+        ).reshape(n, file.n_robots),
         curves=np.array(curves, np.float64).reshape(n, file.n_humans, len(CURVE)),
         deadlines=np.array([NO_DEADLINE if task.deadline is None else task.deadline for task in tasks]),
         waits=np.array([(i, w.after - 1, w.time) for i, task in enumerate(tasks) for w in task.waits], np.int64),

@@ -32,6 +32,7 @@ def schedule(simulator: MurseSimulator, row: int = 0, round_index: int | None = 
     instance, result = simulator.instances[row], simulator.state.rounds[row, chosen]
     executed = simulator.state.executed[row, chosen, : instance.n_tasks]
     dispatched = [i for i in np.argsort(executed["position"], kind="stable") if executed["agent"][i] != NOBODY]
+    ahead = instance.waits_by_task()
     names = ("agent", "start", "finish", *(("committed",) if simulator.mode == "online" else ()))
     return {
         "schema": SCHEMA,
@@ -45,7 +46,7 @@ def schedule(simulator: MurseSimulator, row: int = 0, round_index: int | None = 
         "tasks": [
             {
                 "deadline": None if instance.deadlines[i] == NO_DEADLINE else int(instance.deadlines[i]),
-                "waits": [{"after": int(j) + 1, "time": int(w)} for k, j, w in instance.waits if k == i],
+                "waits": [{"after": j + 1, "time": w} for j, w in ahead[i]],
                 "location": instance.locations[i].tolist(),
                 "eligible": np.flatnonzero(instance.eligible[i]).tolist(),
             }

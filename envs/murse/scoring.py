@@ -74,7 +74,7 @@ def published_loss(state: State, rules: Rules, b: int) -> float:
         for task in range(row.n_tasks):
             if not good[task]:
                 own = state.pairs[b, task, agent].true
-                own = own if own > 0 else state.pairs[b, task].true[: row.n_agents].max()
+                own = own if own >= 0 else state.pairs[b, task].true[: row.n_agents].max()
                 total += own * (1.0 if rules.objective == MAKESPAN else tasks[task].weight)
         left = max(left, total)
     return cost + rules.multiplier * left

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from marl_sched.envs.murse.estimator import FILTER, Prior, new_filters, population_prior
-from marl_sched.envs.murse.instance import MurseInstance
+from marl_sched.envs.murse.instance import INELIGIBLE, MurseInstance
 
 NOBODY, NOTHING, NOT_WAITING = -1, -1, -1
 NEVER = 1 << 40
@@ -70,7 +70,7 @@ AGENT = np.dtype(
 )
 PAIR = np.dtype(
     [
-        ("true", np.int64),  # this round's duration, 0: ineligible
+        ("true", np.int64),  # this round's duration, or INELIGIBLE
         ("planned", np.int64),  # whole duration that plans count on
         ("mean", np.float64),  # estimate
         ("spread", np.float64),  # standard deviation of the estimate and the noise
@@ -109,7 +109,7 @@ class State(NamedTuple):
     tasks: np.ndarray  # TASK (B, N)
     agents: np.ndarray  # AGENT (B, A)
     pairs: np.ndarray  # PAIR (B, N, A)
-    base: np.ndarray  # int64 (B, N, A), first-round mean durations, 0: ineligible
+    base: np.ndarray  # int64 (B, N, A), first-round mean durations, or INELIGIBLE
     curves: np.ndarray  # float64 (B, N, A, 6), zero for robots
     filters: np.ndarray  # FILTER (B, N, A), estimates of stochastic humans
     priors: np.ndarray  # FILTER (B,), filters that have seen nothing
@@ -154,7 +154,8 @@ def load_instance(state: State, b: int, instance: MurseInstance, n_rounds: int) 
     tasks["x"][:n], tasks["y"][:n] = instance.locations.T
     tasks["weight"][:n], tasks["deadline"][:n] = instance.weights, instance.deadlines
     tasks["place"][:n] = np.unique(instance.locations, axis=0, return_inverse=True)[1].reshape(-1)
-    state.base[b], state.curves[b] = 0, 0.0
+    state.base[b], state.curves[b] = INELIGIBLE, 0.0
+    state.pairs["true"][b] = state.pairs["planned"][b] = INELIGIBLE
     state.base[b, :n, :a] = instance.mean_durations
     state.curves[b, :n, robots:a] = instance.curves
     state.lags[b], state.near[b] = -1, False

@@ -113,7 +113,7 @@ def time_batch(
     for b in range(batch):
         good = time_order(orders[b], agents[b], durations, lags, near, starts[b], finishes[b])
         for k in range(n):
-            good = good and durations[orders[b, k], agents[b, k]] > 0
+            good = good and durations[orders[b, k], agents[b, k]] >= 0
         feasible[b] = good and deadlines_hold(orders[b], finishes[b], deadlines)
         makespans[b] = finishes[b].max()
     return starts, finishes, makespans, feasible
@@ -121,7 +121,7 @@ def time_batch(
 
 @kernel
 def worst_case(durations: np.ndarray) -> int:
-    """The largest sum of one agent's durations over all tasks, int64 (N, A) with 0 for ineligible pairs.
+    """The largest sum of one agent's durations over all tasks, int64 (N, A) with INELIGIBLE pairs.
 
     For a task that the agent cannot do, the longest duration of those who can stands in: somebody has to do it.
     """
@@ -130,7 +130,7 @@ def worst_case(durations: np.ndarray) -> int:
         total = 0
         for task in range(durations.shape[0]):
             own = durations[task, agent]
-            total += own if own > 0 else durations[task].max()
+            total += own if own >= 0 else durations[task].max()
         worst = max(worst, total)
     return worst
 

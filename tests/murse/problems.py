@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
-from marl_sched.envs.murse.instance import MurseInstance
+from marl_sched.envs.murse.instance import INELIGIBLE, MurseInstance
 from marl_sched.envs.murse.simulator import MurseSimulator
 
 
 def problem(robots: list[list[int]], **changed: Any) -> MurseInstance:
-    """Tasks with these robot durations, one place each, and whatever else is given."""
+    """Tasks with these robot durations, 0 for ineligible, one place each, and whatever else is given."""
     n = len(robots)
     values: dict[str, Any] = {
-        "robot_durations": robots,
+        "robot_durations": [[duration or INELIGIBLE for duration in row] for row in robots],
         "curves": np.zeros((n, 0, 6)),
         "deadlines": [-1] * n,
         "waits": [],
@@ -68,7 +68,7 @@ def instances(draw: st.DrawFn) -> MurseInstance:
     pairs = [(i, j, int(rng.integers(0, 9))) for i in range(n) for j in range(i) if rng.random() < 0.25]
     rename = rng.permutation(n)
     return MurseInstance(
-        robot_durations=durations,
+        robot_durations=[[duration or INELIGIBLE for duration in row] for row in durations],
         curves=curves,
         deadlines=np.where(rng.random(n) < 0.3, rng.integers(1, 12 * n + 1, n), -1),
         waits=[(rename[i], rename[j], w) for i, j, w in pairs],

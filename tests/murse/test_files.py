@@ -95,7 +95,7 @@ def test_missing_published_file_is_named(tmp_path):
 def test_job_shop_becomes_machines_that_are_eligible_for_their_operations(tmp_path):
     (tmp_path / "two").write_text("# two jobs\n2 2\n0 3 1 2\n1 4 0 1\n")
     instance = formats.load(tmp_path / "two")
-    assert instance.robot_durations.tolist() == [[3, 0], [0, 2], [0, 4], [1, 0]]
+    assert instance.robot_durations.tolist() == [[3, -1], [-1, 2], [-1, 4], [1, -1]]
     assert instance.eligible.tolist() == [[True, False], [False, True], [False, True], [True, False]]
     assert instance.waits.tolist() == [[1, 0, 0], [3, 2, 0]]
 
@@ -103,7 +103,7 @@ def test_job_shop_becomes_machines_that_are_eligible_for_their_operations(tmp_pa
 def test_flexible_job_shop_keeps_the_choice_of_machine(tmp_path):
     (tmp_path / "mk.fjs").write_text("2 3 2\n2 2 1 5 3 4 1 2 1\n1 1 3 6\n")
     instance = formats.load(tmp_path / "mk.fjs")
-    assert instance.robot_durations.tolist() == [[5, 0, 4], [0, 1, 0], [0, 0, 6]]
+    assert instance.robot_durations.tolist() == [[5, -1, 4], [-1, 1, -1], [-1, -1, 6]]
     assert instance.waits.tolist() == [[1, 0, 0]]
 
 
@@ -114,6 +114,15 @@ def test_flexible_job_shop_keeps_the_choice_of_machine(tmp_path):
         ("a", "1 2\n0 3 1\n", "line 2: expected 4 columns"),
         ("a", "1 2\n0 3 2 5\n", "line 2: expected machines in 0..1, got 2"),
         ("a", "1 2\n0 -3 1 5\n", "line 2: expected machines and durations, none of them negative, got '-3'"),
+        ("a", "1 2\n1 3 2 5\n", "0..1 (this seems to be a job shop whose machines are counted from 1), got 2"),
+        (
+            "a",
+            "2 2 1\n1 1 1 3\n1 1 0 4\n",
+            "machines in 1..2 (this seems to be a flexible job shop whose machines are counted from 0), got 0",
+        ),
+        ("a", "1 2 1\n1 1 1 3\n0 4\n4 0\n", "line 3: expected 1 lines of jobs and nothing more; further tables are"),
+        ("a", "1 2\n0 3 1\n0 1 1 4\n1 2 3 4 5\n", "set-up times (SDST) or assembly"),
+        ("a", "0 2\n", "line 1: expected at least one job and one machine, got '0 2'"),
         ("a.fjs", "1 2\n2 1 1 3\n", "line 2: expected 2 operations with at least one machine each, got '1'"),
         ("a.fjs", "1 2\n1 1 1 3 9\n", "line 2: expected nothing after 1 operations, got '9'"),
     ],
@@ -123,6 +132,47 @@ def test_bad_shop_file_is_named_with_its_line(name, text, complaint, tmp_path):
     with pytest.raises(InvalidFileError) as error:
         formats.load(tmp_path / name)
     assert complaint in str(error.value)
+
+
+def test_taillards_format_is_told_by_its_two_tables(tmp_path):
+    heading = "Nb of jobs, Nb of Machines\n"
+    for text in ("2 2\nTimes\n3 2\n4 1\nMachines\n1 2\n2 1\n", "2 2\n3 2\n4 1\n1 2\n2 1\n"):
+        (tmp_path / "ta").write_text(text)
+        instance = formats.load(tmp_path / "ta")
+        assert instance.robot_durations.tolist() == [[3, -1], [-1, 2], [-1, 4], [1, -1]]
+        assert instance.waits.tolist() == [[1, 0, 0], [3, 2, 0]]
+    (tmp_path / "ta").write_text(heading + "2 2\nTimes\n3 2\n4 1\nMachines\n1 2\n2 1\n")
+    assert formats.load(tmp_path / "ta").n_tasks == 4
+
+
+def test_a_flexible_job_shop_is_told_by_its_content_whatever_its_name(tmp_path):
+    (tmp_path / "mk.txt").write_text("2 3\n2 2 1 5 3 4 1 2 1\n1 1 3 6\n")
+    assert formats.load(tmp_path / "mk.txt").robot_durations.tolist() == [[5, -1, 4], [-1, 1, -1], [-1, -1, 6]]
+
+
+def test_an_operation_may_take_no_time(tmp_path):
+    (tmp_path / "orb").write_text("1 2\n0 3 1 0\n")
+    instance = formats.load(tmp_path / "orb")
+    assert instance.robot_durations.tolist() == [[3, -1], [-1, 0]]
+    assert instance.eligible.tolist() == [[True, False], [False, True]]
+    instance.save(tmp_path / "orb.json")
+    assert formats.load(tmp_path / "orb.json").identity == instance.identity
+
+
+def test_in_files_of_the_first_schema_a_duration_of_0_is_ineligible(tmp_path):
+    two_tasks(robot_durations=[[4, -1], [0, 8]]).save(tmp_path / "new.json")
+    assert [task["robots"] for task in json.loads((tmp_path / "new.json").read_text())["tasks"]] == [[4, None], [0, 8]]
+    assert formats.load(tmp_path / "new.json").eligible.tolist() == [[True, False], [True, True]]
+    old = edited(
+        tmp_path / "new.json", lambda d: (d.__setitem__("schema", 1), d["tasks"][0].__setitem__("robots", [4, 0]))
+    )
+    assert formats.load(old).eligible.tolist() == [[True, False], [False, True]]
+
+
+def test_a_folder_offers_every_file_that_should_hold_an_instance(tmp_path):
+    for name in ("b.json", "a.fjs", "ta01", "7.txt", "7_dur.txt", "7_wait.txt", "README.md", "LICENSE", ".hidden"):
+        (tmp_path / name).touch()
+    assert [path.name for path in formats.instance_files(tmp_path)] == ["7.txt", "a.fjs", "b.json", "ta01"]
 
 
 def edited(path: Path, edit) -> Path:
@@ -147,7 +197,7 @@ def edited(path: Path, edit) -> Path:
         ),
         (lambda d: d.__setitem__("proximity", "far"), ", got 'far'"),
         (lambda d: d.__setitem__("colour", 1), "colour: expected one of schema, env, n_robots"),
-        (lambda d: d.__setitem__("schema", 9), "schema: expected 1, got 9"),
+        (lambda d: d.__setitem__("schema", 9), "schema: expected 1 or 2, got 9"),
         (lambda d: d["tasks"][0]["robots"].append(4), "tasks[0].robots"),
         (lambda d: d["tasks"][0].__setitem__("waits", [{"after": 1, "time": 3}]), "tasks 1 -> 1 wait for one another"),
     ],
@@ -182,7 +232,7 @@ def test_cyclic_waits_and_tasks_for_nobody_are_refused():
     with pytest.raises(InvalidOptionError, match="tasks 1 -> 2 -> 1 wait for one another"):
         two_tasks(waits=[(1, 0, 2), (0, 1, 0)])
     with pytest.raises(InvalidOptionError, match=r"tasks\[1\]: no agent is eligible"):
-        two_tasks(robot_durations=[[4], [0]])
+        two_tasks(robot_durations=[[4], [-1]])
 
 
 @pytest.mark.parametrize("scale", list(SCALES))

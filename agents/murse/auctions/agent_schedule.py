@@ -110,7 +110,7 @@ class AgentSchedule:
     def ready(self, task: int) -> bool:
         """Whether the agent can do a task and all that the task waits for are known to be taken."""
         ahead = self.lags[task] >= 0
-        return bool(self.durations[task, self.agent] > 0 and (self.starts[ahead] != UNKNOWN).all())
+        return bool(self.durations[task, self.agent] >= 0 and (self.starts[ahead] != UNKNOWN).all())
 
     def place(self, task: int) -> tuple[int, int, int]:
         """`best_place` of a task in the agent's own path."""

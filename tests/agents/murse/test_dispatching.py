@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,6 +13,8 @@ from marl_sched.agents.murse.dispatching import DISPATCHING_RULES, DispatchingRu
 from marl_sched.agents.murse.latest_start import successors
 from marl_sched.agents.murse.list_schedule import list_schedule
 from marl_sched.agents.murse.problem import Round, timed
+from marl_sched.agents.murse.schedulers import RULES
+from marl_sched.agents.registry import create_scheduler
 from marl_sched.errors import UnknownNameError
 from tests.agents.murse.playing import assert_confirmed, finished
 from tests.murse.problems import instances, problem
@@ -117,3 +121,17 @@ def shop(n_jobs: int, n_machines: int, seed: int) -> Round:
         weights=np.ones(n), fixed=np.full(n, -1, np.int64), agents=np.full(n, -1, np.int64),
         ready=np.zeros(n_machines, np.int64),
     )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", RULES)
+@pytest.mark.parametrize("mode", ["plan", "online"])
+def test_operations_that_take_no_time_are_scheduled_by_everybody(name, mode):
+    # two jobs of three operations on three machines; the second operation of job 1 and the first of job 2 take nothing
+    rows = [[3, -1, -1], [-1, 0, -1], [-1, -1, 2], [-1, 0, -1], [4, -1, -1], [-1, -1, 1]]
+    waits = [(1, 0, 0), (2, 1, 0), (4, 3, 0), (5, 4, 0)]
+    instance = replace(problem([[1, 1, 1]] * 6, waits=waits, proximity="none"), robot_durations=np.array(rows))
+    simulator = finished(create_scheduler(name, "murse"), [instance], mode=mode)
+    assert_confirmed(simulator)
+    assert simulator.round_results(0)["feasible"][0]
+    # machine 1 takes 7 and one of its operations is last, with at least one unit on machine 3 behind it
+    assert simulator.round_results(0)["makespan"][0] >= 8
