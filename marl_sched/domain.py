@@ -101,6 +101,11 @@ def _none_known(instance: Any) -> list[str]:
     return []
 
 
+def _json_files(folder: Path) -> list[Path]:
+    """The JSON files of a folder, sorted."""
+    return sorted(folder.glob("*.json"))
+
+
 @dataclass(frozen=True, kw_only=True)
 class Demo:
     """What `marl-sched demo` shows of a domain: one deployed episode, then a comparison on other instances.
@@ -157,6 +162,9 @@ class Domain:
         bound: the module, by its name, that proves upper bounds (`Relaxation` and `upper_bounds`); None: none is known.
         generate_accepted: (scale, rng, accept) -> an instance that `accept` takes, redrawn until it does; None:
             every generated instance can be solved.
+        instance_files: folder -> the files in it that should hold an instance each, sorted.
+        save_schedules: (simulator, row, path without suffix) -> the files it wrote of a row's ended rounds, for an
+            independent check; None: the domain has no such files.
         impossibilities: instance -> why no schedule of it can be feasible, a sentence each; empty if none is known.
         demo: what `marl-sched demo` shows; None: nothing.
         pressing: observation -> the legal actions, bool (B, n_actions), one of which a greedy policy takes before it
@@ -191,6 +199,8 @@ class Domain:
     bound: str | None = None
     generate_accepted: Callable[[str, np.random.Generator, Callable[[Any], bool]], Any] | None = None
     impossibilities: Callable[[Any], list[str]] = _none_known
+    instance_files: Callable[[Path], list[Path]] = _json_files
+    save_schedules: Callable[[Any, int, Path], list[Path]] | None = None
     demo: Demo | None = None
     pressing: Callable[[Mapping[str, np.ndarray]], np.ndarray] | None = None
     legend: Mapping[str, Sequence[int]] | None = None

@@ -22,27 +22,31 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from marl_sched.agents.murse.following import PlanningScheduler
 from marl_sched.agents.murse.latest_start import common_horizon, latest_starts, shortest_durations, successors
 from marl_sched.agents.murse.problem import Plan, Round
 from marl_sched.agents.murse.snapshot import as_expected, estimated_round, remaining_round
+from marl_sched.envs.murse.instance import NO_DEADLINE
 from marl_sched.envs.murse.simulator import MurseSimulator
 from marl_sched.envs.murse.timetable import deadlines_hold
 from marl_sched.errors import require
+from marl_sched.kernels import kernel
 
 DISPATCHING_RULES = ("spt", "lpt", "wspt", "mwkr", "mopnr", "fifo", "edd", "slack-per-operation", "atc")
+PRIORITY_RULES = (*DISPATCHING_RULES, "edf", "hctf")
+"""With the two rules of the dissertation, which rank by a task's own deadline and by its weight alone."""
 LOOK_AHEAD = 2.0
 """K of `atc`."""
-_SPT, _LPT, _WSPT, _MWKR, _MOPNR, _FIFO, _EDD, _SLACK, _ATC = range(len(DISPATCHING_RULES))
+_SPT, _LPT, _WSPT, _MWKR, _MOPNR, _FIFO, _EDD, _SLACK, _ATC, _EDF, _HCTF = range(len(PRIORITY_RULES))
 _LEAST = 1e-9  # stands for a duration of 0 where one divides by it
 _NEVER = 1 << 60
 
 
-@njit(cache=True)
+@kernel
 def remaining(
     means: np.ndarray, first: np.ndarray, tasks: np.ndarray, lags: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -70,120 +74,138 @@ def remaining(
     return work, operations
 
 
-@njit(cache=True)
-def priority(
-    rule: int, p: float, due: float, weight: float, released: int, work: float, operations: int, clock: int, mean: float
-) -> float:
-    """What the rule minimises for a task and an agent, see the module's table; `mean` is the mean duration."""
-    if rule == _SPT:
-        return p
-    if rule == _LPT:
-        return -p
-    if rule == _WSPT:
-        return -weight / max(p, _LEAST)
-    if rule == _MWKR:
-        return -work
-    if rule == _MOPNR:
-        return -float(operations)
-    if rule == _FIFO:
+class Urgency(NamedTuple):
+    """What the rules rank by.
+
+    Attributes:
+        rule: the number of a rule in PRIORITY_RULES.
+        keys: float64 (N, A), what a rule that does not look at the clock minimises.
+        due: float64 (N,), latest finishes.
+        work: float64 (N,), work remaining.
+        operations: int64 (N,), operations remaining.
+        weights: float64 (N,).
+        mean: the mean duration.
+    """
+
+    rule: int
+    keys: np.ndarray
+    due: np.ndarray
+    work: np.ndarray
+    operations: np.ndarray
+    weights: np.ndarray
+    mean: float
+
+
+def urgency_of(problem: Round, rule: str) -> Urgency:
+    """What a rule of PRIORITY_RULES ranks the tasks of a problem by; UnknownNameError for another name."""
+    code = PRIORITY_RULES.index(require("dispatching rule", rule, PRIORITY_RULES))
+    durations, eligible = problem.durations, problem.eligible
+    means = np.where(eligible, durations, 0).sum(axis=1) / eligible.sum(axis=1)
+    work, operations = remaining(means, *successors(problem.lags))
+    due = latest_starts(durations, problem.lags, problem.deadlines, common_horizon(durations))
+    due = due + shortest_durations(durations)
+    dated = np.where(problem.deadlines == NO_DEADLINE, np.inf, problem.deadlines)
+    by_task = {"mwkr": -work, "mopnr": -operations, "edd": due, "edf": dated, "hctf": -problem.weights}
+    by_pair = {"spt": durations, "lpt": -durations, "wspt": -problem.weights[:, None] / np.maximum(durations, _LEAST)}
+    keys = by_pair[rule] if rule in by_pair else by_task.get(rule, np.zeros(len(due)))[:, None]
+    return Urgency(
+        rule=code,
+        keys=np.ascontiguousarray(np.broadcast_to(keys, durations.shape), np.float64),
+        due=due,
+        work=work,
+        operations=operations,
+        weights=problem.weights,
+        mean=max(float(means.mean()), _LEAST),
+    )
+
+
+@kernel
+def priority(urgency: Urgency, task: int, agent: int, p: int, released: int, clock: int) -> float:
+    """What the rule minimises for a task and an agent whose duration is p; see the module's table."""
+    if urgency.rule == _FIFO:
         return float(released)
-    if rule == _EDD:
-        return due
-    if rule == _SLACK:
-        return (due - clock - work) / operations
-    return -weight / max(p, _LEAST) * np.exp(-max(due - p - clock, 0.0) / (LOOK_AHEAD * mean))
+    if urgency.rule == _SLACK:
+        return (urgency.due[task] - clock - urgency.work[task]) / urgency.operations[task]
+    if urgency.rule == _ATC:
+        slack = max(urgency.due[task] - p - clock, 0.0)
+        return -urgency.weights[task] / max(float(p), _LEAST) * np.exp(-slack / (LOOK_AHEAD * urgency.mean))
+    return urgency.keys[task, agent]
 
 
-@njit(cache=True)
+@kernel
+def _first_open(
+    urgency: Urgency, durations: np.ndarray, agent: int, clock: int, open_: np.ndarray, release: np.ndarray
+) -> int:
+    """The place in `open_`, int64 (k,), of the task that an agent starts at `clock`, -1 for none."""
+    best, least = -1, np.inf
+    for k in range(len(open_)):
+        task = open_[k]
+        if durations[task, agent] < 0 or release[task] > clock:
+            continue
+        key = priority(urgency, task, agent, durations[task, agent], release[task], clock)
+        if best < 0 or key < least or (key == least and task < open_[best]):
+            best, least = k, key
+    return best
+
+
+@kernel
 def dispatch_rule(
-    rule: int,
+    urgency: Urgency,
     durations: np.ndarray,
-    lags: np.ndarray,
+    waits: tuple[np.ndarray, np.ndarray, np.ndarray],
     near: np.ndarray,
-    deadlines: np.ndarray,
-    weights: np.ndarray,
     free_at: np.ndarray,
     order: np.ndarray,
     count: int,
     doers: np.ndarray,
     finish: np.ndarray,
 ) -> int:
-    """Append to `order`, int64 (N,), of which the first `count` are dispatched, by a rule of DISPATCHING_RULES.
+    """Append to `order`, int64 (N,), of which the first `count` are dispatched.
 
-    The arrays are those of a Round; doers and finish int64 (N,) hold agents and finishes of dispatched tasks and are
-    written, free_at int64 (A,) likewise. Free agents choose in the order of their index; ties go to the lower task.
-    Returns how many are dispatched then.
+    durations and near are those of a Round, `waits` is what `successors` returns; doers and finish int64 (N,) hold
+    agents and finishes of dispatched tasks and are written, free_at int64 (A,) likewise. Free agents choose in the
+    order of their index. Returns how many are dispatched then.
     """
     n, m = durations.shape
-    first, waiting, times = successors(lags)
-    means, mean = _mean_durations(durations)
-    work, operations = remaining(means, first, waiting, times)
-    due = latest_starts(durations, lags, deadlines, common_horizon(durations)) + shortest_durations(durations)
+    first, waiting, times = waits
     ahead, release, done = np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n, np.bool_)
     for k in range(first[n]):
         ahead[waiting[k]] += 1
     for k in range(count):
         done[order[k]] = True
         _release(order[k], finish[order[k]], first, waiting, times, near, ahead, release)
-    open_, n_open = np.empty(n, np.int64), 0
-    for task in range(n):
-        if not done[task] and ahead[task] == 0:
-            open_[n_open] = task
-            n_open += 1
-    clock = free_at.min()
+    open_ = np.empty(n, np.int64)
+    startable = np.flatnonzero(~done & (ahead == 0))
+    n_open = len(startable)
+    open_[:n_open] = startable
+    clock, agent = free_at.min(), 0
     while count < n:
-        agent = -1
-        while agent < m - 1:
+        if agent == m:
+            clock, agent = _next_time(clock, free_at, open_, n_open, release), 0
+            if clock == _NEVER:
+                break
+        place = (
+            _first_open(urgency, durations, agent, clock, open_[:n_open], release) if free_at[agent] <= clock else -1
+        )
+        if place < 0:
             agent += 1
-            if free_at[agent] > clock:
-                continue
-            best, least = -1, np.inf
-            for k in range(n_open):
-                task = open_[k]
-                p = durations[task, agent]
-                if p < 0 or release[task] > clock:
-                    continue
-                key = priority(
-                    rule, p, due[task], weights[task], release[task], work[task], operations[task], clock, mean
-                )
-                if best < 0 or key < least or (key == least and task < open_[best]):
-                    best, least = k, key
-            if best < 0:
-                continue
-            task = open_[best]
-            n_open -= 1
-            open_[best] = open_[n_open]
-            order[count], doers[task], done[task] = task, agent, True
-            count += 1
-            finish[task] = free_at[agent] = clock + durations[task, agent]
-            _release(task, finish[task], first, waiting, times, near, ahead, release)
-            for k in range(first[task], first[task + 1]):
-                if ahead[waiting[k]] == 0:
-                    open_[n_open] = waiting[k]
-                    n_open += 1
-            if free_at[agent] == clock:  # it took no time: everybody may look again
-                agent = -1
-        clock = _next_time(clock, free_at, open_, n_open, release)
-        if clock == _NEVER:
-            break
+            continue
+        task = open_[place]
+        n_open -= 1
+        open_[place] = open_[n_open]
+        order[count], doers[task] = task, agent
+        count += 1
+        finish[task] = free_at[agent] = clock + durations[task, agent]
+        _release(task, finish[task], first, waiting, times, near, ahead, release)
+        for k in range(first[task], first[task + 1]):
+            if ahead[waiting[k]] == 0:
+                open_[n_open] = waiting[k]
+                n_open += 1
+        agent = 0 if durations[task, agent] == 0 else agent + 1  # nothing may have passed: everybody looks again
     return count
 
 
-@njit(cache=True)
-def _mean_durations(durations: np.ndarray) -> tuple[np.ndarray, float]:
-    """The mean over eligible agents, float64 (N,), and the mean of those."""
-    means = np.zeros(len(durations))
-    for task in range(len(durations)):
-        able = 0
-        for agent in range(durations.shape[1]):
-            if durations[task, agent] >= 0:
-                means[task] += durations[task, agent]
-                able += 1
-        means[task] /= max(able, 1)
-    return means, max(means.mean(), _LEAST)
-
-
-@njit(cache=True)
+@kernel
 def _release(
     task: int,
     end: int,
@@ -203,7 +225,7 @@ def _release(
             release[other] = max(release[other], end)
 
 
-@njit(cache=True)
+@kernel
 def _next_time(clock: int, free_at: np.ndarray, open_: np.ndarray, n_open: int, release: np.ndarray) -> int:
     """When, after `clock`, the next agent is free or the next open task can start; _NEVER if neither happens."""
     after = _NEVER
@@ -217,8 +239,8 @@ def _next_time(clock: int, free_at: np.ndarray, open_: np.ndarray, n_open: int, 
 
 
 def dispatched(problem: Round, rule: str) -> Plan:
-    """The schedule of a rule of DISPATCHING_RULES behind what is committed to; UnknownNameError for another name."""
-    code = DISPATCHING_RULES.index(require("dispatching rule", rule, DISPATCHING_RULES))
+    """The schedule of a rule of PRIORITY_RULES behind what is committed to; UnknownNameError for another name."""
+    urgency = urgency_of(problem, rule)
     n = problem.n_tasks
     committed = np.flatnonzero(problem.fixed >= 0)
     committed = committed[np.argsort(problem.fixed[committed], kind="stable")]
@@ -226,8 +248,8 @@ def dispatched(problem: Round, rule: str) -> Plan:
     order[: len(committed)] = committed
     finish[committed] = problem.fixed[committed] + problem.durations[committed, doers[committed]]
     count = dispatch_rule(
-        code, problem.durations, problem.lags, problem.near, problem.deadlines, problem.weights, problem.ready.copy(),
-        order, len(committed), doers, finish,
+        urgency, problem.durations, successors(problem.lags), problem.near, problem.ready.copy(), order,
+        len(committed), doers, finish,
     )  # fmt: skip
     tasks, starts = order[:count], np.zeros(n, np.int64)
     starts[tasks] = finish[tasks] - problem.durations[tasks, doers[tasks]]

@@ -6,9 +6,10 @@ from abc import abstractmethod
 
 import numpy as np
 
-from marl_sched.agents.base import PrivilegedInfo, Scheduler
+from marl_sched.agents.base import EpochPlayer, PrivilegedInfo, Scheduler
 from marl_sched.agents.murse.problem import Plan
 from marl_sched.agents.murse.snapshot import as_murse
+from marl_sched.agents.murse.whole_rounds import round_player
 from marl_sched.envs.murse.simulator import MurseSimulator
 from marl_sched.envs.murse.state import NOBODY
 from marl_sched.simulation import TurnSimulator
@@ -41,6 +42,10 @@ class PlanningScheduler(Scheduler):
         if len(self._rounds) != simulator.batch:
             self._rounds, self._plans = np.full(simulator.batch, -1), [None] * simulator.batch
         self._rounds[rows] = -1
+
+    def epoch_player(self, simulator: TurnSimulator) -> EpochPlayer | None:
+        """Plays each plan as a whole round where nothing can be revised in between."""
+        return round_player(as_murse(simulator), self.plan)
 
     def decide(self, simulator: TurnSimulator) -> np.ndarray:
         """Actions int64 (B,)."""

@@ -75,19 +75,21 @@ class ExactScheduler(PlanningScheduler):
         solution = solve(problem, objective=simulator.objective, start=first, **self._limits)
         now = int(simulator.state.rows["round"][row])
         self.solutions[row, now] = solution
+        instance = simulator.instances[row]
+        certain = instance.durations == "deterministic" or instance.n_humans == 0
         new = {
-            "bound": solution.bound,
+            "bound": solution.bound if certain else np.nan,  # a bound on estimates proves nothing of what happens
             "optimal": solution.status == "optimal",
             "timed_out": solution.timed_out,
             "without_plan": solution.plan is None,
             "solver_seconds": solution.seconds,
         }
+        again = not np.isnan(self._measures["optimal"][row, now])
         for name, value in new.items():
-            before = self._measures[name][row, now]
-            if np.isnan(before):
+            if not again:
                 self._measures[name][row, now] = value
             elif name != "bound":
-                self._measures[name][row, now] = before + value
+                self._measures[name][row, now] += value
         return first if solution.plan is None else solution.plan
 
 

@@ -11,11 +11,14 @@ from collections.abc import Callable, Mapping
 import msgspec
 import numpy as np
 
-from marl_sched.agents.base import ObservationScheduler, best_action
+from marl_sched.agents.base import EpochPlayer, ObservationScheduler, best_action
+from marl_sched.agents.murse.dispatching import dispatched
 from marl_sched.agents.murse.list_schedule import NO_DEADLINE_PRIORITY
-from marl_sched.agents.murse.snapshot import as_murse
+from marl_sched.agents.murse.snapshot import as_murse, estimated_round
 from marl_sched.agents.murse.traffic import Traffic
+from marl_sched.agents.murse.whole_rounds import round_player
 from marl_sched.envs.murse.graph import DEADLINE, EARLIEST_FINISH, EARLIEST_START, HAS_DEADLINE, WEIGHT
+from marl_sched.envs.murse.rules import FIRST
 from marl_sched.simulation import TurnSimulator
 
 Observation = Mapping[str, np.ndarray]
@@ -29,10 +32,20 @@ def legal_tasks(observation: Observation) -> np.ndarray:
 
 
 class PriorityRule(ObservationScheduler):
-    """The startable task of the highest priority; `priority` maps task features (B, T, F) to float64 (B, T)."""
+    """The startable task of the highest priority; `priority` maps task features (B, T, F) to float64 (B, T).
+
+    `name` is that of the same rule in PRIORITY_RULES.
+    """
 
     def __init__(self, name: str, priority: Callable[[np.ndarray], np.ndarray]) -> None:
         self.name, self._priority = name, priority
+
+    def epoch_player(self, simulator: TurnSimulator) -> EpochPlayer | None:
+        """Plays whole rounds by the compiled rule, where the first free agent decides first and all is seen."""
+        murse = as_murse(simulator)
+        if murse.rules.picking != FIRST:
+            return None
+        return round_player(murse, lambda simulator, row: dispatched(estimated_round(simulator, row), self.name))
 
     def choose(self, observation: Observation, uniform: np.ndarray) -> np.ndarray:
         """Actions int64 (B,), ties to the lower index; `uniform` is not used."""

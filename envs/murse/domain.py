@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from marl_sched.domain import Domain
-from marl_sched.envs.murse.formats import load
+from marl_sched.envs.murse.formats import instance_files, load
 from marl_sched.envs.murse.generate import SCALES, generate
 from marl_sched.envs.murse.instance import MurseInstance
 from marl_sched.envs.murse.reading import decode
@@ -37,4 +37,6 @@ MURSE = Domain(
     benchmarks=lazy("marl_sched.agents.murse.bench:benchmarks"),
     generate_accepted=generate,
     impossibilities=MurseInstance.impossibilities,
+    instance_files=instance_files,
+    save_schedules=lazy("marl_sched.envs.murse.schedule:save_schedules"),
 )

@@ -68,3 +68,12 @@ def schedule(simulator: MurseSimulator, row: int = 0, round_index: int | None = 
 def save_schedule(simulator: MurseSimulator, path: str | Path, row: int = 0, round_index: int | None = None) -> None:
     """Write `schedule` as JSON, beside and renamed."""
     write_json(path, schedule(simulator, row, round_index))
+
+
+def save_schedules(simulator: MurseSimulator, row: int, path: Path) -> list[Path]:
+    """Write every ended round of a row to `path` with the round's number and .json behind it; the files written."""
+    paths = []
+    for k in range(int(simulator.state.rows["round"][row])):
+        paths.append(path.with_name(f"{path.name}-round{k}.json"))
+        save_schedule(simulator, paths[-1], row, k)
+    return paths

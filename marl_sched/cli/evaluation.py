@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -11,10 +12,19 @@ from marl_sched.cli import options
 from marl_sched.cli.compilation import told_of_compilation
 from marl_sched.cli.grouped import DOMAIN_OPTIONS, takes
 from marl_sched.cli.selection import Resolved, Selection
+from marl_sched.errors import InvalidOptionError
+
+if TYPE_CHECKING:
+    from marl_sched.problem import Problem
 
 _SELECTORS = (
     f"--env {options.DEFAULT_ENV} --scale small --instances 100 --episodes 10 --schedulers corrective,condition"
 )
+
+
+SaveSchedules = Annotated[
+    Path | None, typer.Option("--save-schedules", metavar="DIR", help="Write every round's schedule here, as JSON.")
+]
 
 
 def add_to(app: typer.Typer) -> None:
@@ -26,7 +36,13 @@ def add_to(app: typer.Typer) -> None:
     app.command(epilog=f"Example: marl-sched bench --env {options.DEFAULT_ENV} --json bench.json")(bench)
 
 
-def evaluate(selection: Selection, *, json: options.JsonFile = None, format: options.Format = "table") -> None:
+def evaluate(
+    selection: Selection,
+    *,
+    json: options.JsonFile = None,
+    format: options.Format = "table",
+    save_schedules: SaveSchedules = None,
+) -> None:
     """Play schedulers on the same instances with the same noise and print their scores."""
     from marl_sched.cli.tables import FORMATS, print_scores
     from marl_sched.errors import require
@@ -34,7 +50,9 @@ def evaluate(selection: Selection, *, json: options.JsonFile = None, format: opt
 
     options.check_output(json)
     require("format", format, FORMATS)
-    results = play(selection.resolve(), selection.baseline)
+    if save_schedules is not None:
+        options.check_folder(save_schedules, "--save-schedules")
+    results = play(selection.resolve(), selection.baseline, save_schedules)
     print_scores(results, format, stderr=json == STDOUT)  # first: what was computed is seen, whatever the disk says
     if json is not None:
         write_json(json, results)
@@ -78,8 +96,11 @@ def compare(
     typer.echo(draw_timelines(out / "timelines.png", problem.domain, episodes, problem.objective))
 
 
-def play(resolved: Resolved, baseline: str | None) -> dict[str, Any]:
-    """Evaluate what was selected, and tell on stderr how far it is; schema 2."""
+def play(resolved: Resolved, baseline: str | None, schedules: Path | None = None) -> dict[str, Any]:
+    """Evaluate what was selected, and tell on stderr how far it is; schema 2.
+
+    `schedules` is a folder for the schedules of every round, with a folder for each scheduler; None: none are kept.
+    """
     from marl_sched.agents.registry import create_scheduler
     from marl_sched.cli.progress import progress
     from marl_sched.train.evaluation.evaluate import evaluate
@@ -94,8 +115,28 @@ def play(resolved: Resolved, baseline: str | None) -> dict[str, Any]:
             reference=create_scheduler(domain.reference, domain) if domain.reference else None,
             baseline=baseline,
             progress=tell,
+            ended=None if schedules is None else _keeper(resolved.problem, schedules),
         )
         return table.as_json()
+
+
+def _keeper(problem: Problem, folder: Path) -> Callable[[str, Any, range], None]:
+    """Writes the schedules of simulators whose episodes are over; InvalidOptionError where a domain has none."""
+    save = problem.domain.save_schedules
+    if save is None:
+        raise InvalidOptionError(f"--save-schedules: the environment {problem.domain.name!r} has no schedules")
+    files = problem.files or (None,) * problem.count
+
+    def keep(name: str, simulator: Any, rows: range) -> None:
+        place = folder / name.replace("/", "-")
+        place.mkdir(parents=True, exist_ok=True)
+        for row, number in enumerate(rows):
+            instance, episode = divmod(number, problem.episodes)
+            file = files[instance]
+            stem = f"instance{instance}" if file is None else file.stem
+            save(simulator, row, place / f"{stem}-episode{episode}")
+
+    return keep
 
 
 def bench(

@@ -33,7 +33,7 @@ View = Annotated[
     str, typer.Option("--view", help="What an acting agent sees; its own options are options too, as in --reach 1.")
 ]
 Instances = Annotated[
-    str, typer.Option("--instances", metavar="N|DIR", help="How many to generate, or a folder of instance files.")
+    str, typer.Option("--instances", metavar="N|PATH", help="How many to generate, an instance file, or a folder.")
 ]
 JsonFile = Annotated[
     Path | None,
@@ -55,7 +55,7 @@ def state_problem(
 ) -> Problem:
     """The problem that words of the command line state.
 
-    `instances` is how many to generate, a folder of instance files (*.json) or one file; None: one is generated.
+    `instances` is how many to generate, a folder of instance files or one file; None: one is generated.
     `own` holds the options that only this environment or this view has: the horizon by the name of its unit
     (`--hours 48`), the view's options, and the simulator's. Raises UnknownNameError for an option that nobody has.
     """
@@ -112,11 +112,15 @@ def _source(domain: Domain, instances: str | Path | None, scale: str | None) -> 
             raise InvalidOptionError(f"--instances: expected at least 1, got {instances}")
         return {"scale": scale, "count": int(instances)}
     folder = Path(instances)
+    if folder.is_file():
+        return {"instances": [folder]}
     if not folder.is_dir():
-        raise InvalidOptionError(f"--instances: expected a number or a folder of instance files, got {instances!r}")
-    paths = sorted(folder.glob("*.json"))
+        raise InvalidOptionError(
+            f"--instances: expected a number, an instance file or a folder of them, got {instances!r}"
+        )
+    paths = domain.instance_files(folder)
     if not paths:
-        raise InvalidFileError(folder, "", "at least one instance file (*.json)")
+        raise InvalidFileError(folder, "", "at least one instance file")
     return {"instances": paths}
 
 

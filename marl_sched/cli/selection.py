@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from marl_sched.cli import options
 from marl_sched.cli.grouped import OwnOptions
-from marl_sched.errors import InvalidOptionError
+from marl_sched.errors import InvalidOptionError, require
 
 if TYPE_CHECKING:
     from marl_sched.agents.base import Scheduler
@@ -24,7 +25,11 @@ class Selection:
 
     schedulers: Annotated[
         str,
-        typer.Option("--schedulers", metavar="A,B,C", help="Rules and shipped policies by name, checkpoints by path."),
+        typer.Option(
+            "--schedulers",
+            metavar="A,B,C",
+            help="Rules and shipped policies by name, checkpoints by path. NAME@OPTION=VALUE sets a rule's option.",
+        ),
     ] = ""
     scheduler: Annotated[
         list[str] | None,
@@ -45,6 +50,10 @@ class Selection:
         ),
     ] = None
     view: options.View = "full"
+    time_limit: Annotated[
+        float | None,
+        typer.Option("--time-limit", metavar="S", help="Wall seconds of a solver's run (default: its own limit)."),
+    ] = None
     own: OwnOptions
 
     def resolve(self) -> Resolved:
@@ -52,7 +61,7 @@ class Selection:
         from marl_sched.domain import get_domain
 
         names = [*self.schedulers.split(","), *(self.scheduler or [])]
-        schedulers = create_schedulers(get_domain(self.env), names)
+        schedulers = create_schedulers(get_domain(self.env), names, self.time_limit)
         problem = options.state_problem(
             self.env,
             self.own,
@@ -65,7 +74,11 @@ class Selection:
         )
         for name, scheduler in schedulers.items():
             options.tell_of_training(name, getattr(scheduler, "card", None), problem.view, problem.objective)
-        captions = {f"instance {i}": instance for i, instance in enumerate(problem.instances)}
+        files = problem.files or (None,) * problem.count
+        captions = {
+            f"instance {i}" if file is None else str(file): instance
+            for i, (file, instance) in enumerate(zip(files, problem.instances, strict=True))
+        }
         options.warn_of_impossible(problem.domain, captions)
         return Resolved(problem, schedulers)
 
@@ -78,11 +91,46 @@ class Resolved:
     schedulers: dict[str, Scheduler]
 
 
-def create_schedulers(domain: Domain, names: Iterable[str]) -> dict[str, Scheduler]:
-    """The schedulers by the names that were typed, in their order; InvalidOptionError if there is none."""
+def create_schedulers(domain: Domain, names: Iterable[str], time_limit: float | None = None) -> dict[str, Scheduler]:
+    """The schedulers by the words that were typed, in their order; InvalidOptionError if there is none.
+
+    A word is a name and, each behind an `@`, options of that scheduler: `lst-search@evaluations=32`. `time_limit`
+    goes to those that have such an option and were not given another one; one of them must have it.
+    """
     from marl_sched.agents.registry import create_scheduler
 
     typed = [name.strip() for name in names if name.strip()]
     if not typed:
         raise InvalidOptionError("--schedulers: expected at least one name")
-    return {name: create_scheduler(name, domain) for name in typed}
+    schedulers: dict[str, Scheduler] = {}
+    limited = 0
+    for word in typed:
+        name, *pairs = word.split("@")
+        known = scheduler_options(domain, name)
+        given = dict(_option(word, pair, known) for pair in pairs)
+        if time_limit is not None and "time_limit" in known:
+            given.setdefault("time_limit", time_limit)
+            limited += 1
+        schedulers[word] = create_scheduler(name, domain, **given)
+    if time_limit is not None and not limited:
+        raise InvalidOptionError(f"--time-limit: none of {', '.join(typed)} has a limit")
+    return schedulers
+
+
+def scheduler_options(domain: Domain, name: str) -> list[str]:
+    """The options that a domain's rule can be given by name; none for a policy, or a name that nobody has."""
+    from marl_sched.agents.registry import rules
+
+    factory = rules(domain).get(name)
+    if factory is None:
+        return []
+    parameters = inspect.signature(factory).parameters.values()
+    return [one.name for one in parameters if one.kind in (one.POSITIONAL_OR_KEYWORD, one.KEYWORD_ONLY)]
+
+
+def _option(word: str, pair: str, known: list[str]) -> tuple[str, Any]:
+    name, equals, text = pair.partition("=")
+    name = name.replace("-", "_")
+    if not equals:
+        raise InvalidOptionError(f"{word}: expected @option=value, got @{pair}")
+    return require(f"option of scheduler {word.partition('@')[0]}", name, known), options.as_value(text)

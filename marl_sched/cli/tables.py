@@ -17,6 +17,7 @@ from marl_sched.errors import require
 
 _WIDE = 110  # columns of a terminal
 _ALWAYS = ("feasible",)  # without which M1 says little
+_OF_SOLVERS = ("bound", "optimal", "timed_out", "without_plan")  # told by round, without a spread over instances
 _NAME_WIDTH = 24  # columns for a scheduler's name and what is said of it
 _SHORTEST_NAME = 12  # columns that a name keeps on a narrow terminal
 FORMATS = ("table", "markdown", "latex", "csv", "json")
@@ -64,7 +65,7 @@ def _flat_row(results: dict[str, Any], name: str, row: dict[str, Any]) -> dict[s
     flat: dict[str, Any] = {"scheduler": name}
     measures = ["M1", "difference", *(["M2"] if "reference" in results else []), *_other_measures(results)]
     for measure in measures:
-        of = row[measure]
+        of = row.get(measure, {"mean": None})
         flat |= {f"{measure} {part}": of[part] for part in ("mean", "std", "iqm") if part in of}
         for interval in ("ci95_such_instances", "ci95_these_instances"):
             if interval in of:
@@ -87,7 +88,7 @@ def _cells(results: dict[str, Any], row: dict[str, Any], measures: list[str]) ->
     ]
     if "reference" in results:
         cells.append(f"{row['M2']['mean']:.1f}\n{_spread(row['M2'], 1)}")
-    return cells + [f"{_number(row[measure]['mean'], 4)}\n{_spread(row[measure])}" for measure in measures]
+    return cells + [_cell(row.get(measure)) for measure in measures]
 
 
 def _print_table(results: dict[str, Any], console: Console) -> None:
@@ -156,9 +157,21 @@ def print_bench(figures: dict[str, Any], *, stderr: bool = False) -> None:
 
 
 def _other_measures(results: dict[str, Any]) -> list[str]:
-    row = next(iter(results["schedulers"].values()))
     known = ("M1", "M2", "difference", results["objective"])
-    return [name for name, value in row.items() if isinstance(value, dict) and "std" in value and name not in known]
+    found: dict[str, None] = {}
+    for row in results["schedulers"].values():
+        for name, value in row.items():
+            if isinstance(value, dict) and name not in known and ("std" in value or name in _OF_SOLVERS):
+                found[name] = None
+    return list(found)
+
+
+def _cell(value: dict[str, Any] | None) -> str:
+    """Mean and standard deviation of a measure; empty where a scheduler does not have it."""
+    if value is None or value["mean"] is None:
+        return ""
+    mean = _number(value["mean"], 4)
+    return f"{mean}\n{_spread(value)}" if "std" in value else mean
 
 
 def _intervals(of: dict[str, Any]) -> str:

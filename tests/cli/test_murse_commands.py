@@ -9,6 +9,7 @@ from marl_sched.agents.murse.exact import solve
 from marl_sched.agents.murse.problem import Round
 from marl_sched.domain import get_domain
 from marl_sched.envs.murse.reading import load
+from marl_sched.envs.murse.validation import validate
 from marl_sched.train import bench
 
 
@@ -63,4 +64,44 @@ def test_a_hopeless_instance_is_told_in_one_line_on_stderr(run, tmp_path):
     )
     assert ended.code == 0
     assert ended.err.count("\n") == 1
-    assert ended.err.startswith("warning: instance 1: no schedule can be feasible: task 1: deadline 1 but no finish")
+    assert ended.err.startswith(f"warning: {tmp_path / 'b.json'}: no schedule can be feasible: task 1: deadline 1 but")
+
+
+def test_files_of_all_formats_are_evaluated_with_a_row_for_each_and_their_schedules_confirmed(run, tmp_path):
+    shops, out, kept = tmp_path / "shops", tmp_path / "r.json", tmp_path / "kept"
+    shops.mkdir()
+    (shops / "flow").write_text("2 2\n0 3 1 2\n0 4 1 0\n")  # machine 1: 3 + 4, then machine 2 needs 0: 7 in all
+    (shops / "mini.fjs").write_text("2 3 2\n2 2 1 5 3 4 1 2 1\n1 1 3 6\n")
+    get_domain("murse").instances("small", 1, 0)[0].save(shops / "ours.json")
+    (shops / "README.md").write_text("not an instance")
+    words = ("--schedulers", "spt,lst-search@evaluations=8,exact", "--time-limit", 30, "--json", out)
+    ended = run(
+        "evaluate", "--env", "murse", "--instances", shops, "--rounds", 1, "--episodes", 1, *words,
+        "--save-schedules", kept,
+    )  # fmt: skip
+    assert ended.code == 0, ended.err
+    results = json.loads(out.read_text())
+    rows = results["by_instance"]
+    assert [row["file"] for row in rows] == [str(shops / name) for name in ("flow", "mini.fjs", "ours.json")]
+    exact = [row["schedulers"]["exact"] for row in rows]
+    assert [one["status"] for one in exact] == ["optimal"] * 3
+    assert (exact[0]["objective"], exact[0]["bound"], exact[0]["gap_to_bound"]) == (7.0, 7.0, 0.0)
+    assert all(
+        row["schedulers"]["lst-search@evaluations=8"]["objective"] >= row["schedulers"]["exact"]["bound"]
+        for row in rows
+    )
+    assert results["schedulers"]["exact"]["gap_to_exact"]["mean"] == 0.0
+    files = sorted(kept.rglob("*.json"))
+    assert len(files) == 3 * 3
+    assert all(
+        validate(json.loads(path.read_text())).feasible == json.loads(path.read_text())["feasible"] for path in files
+    )
+    assert (kept / "spt" / "flow-episode0-round0.json").exists()
+
+
+def test_a_time_limit_without_a_solver_and_unknown_options_of_schedulers_are_refused(run):
+    selection = ("evaluate", "--env", "murse", "--instances", 1, "--schedulers")
+    ended = run(*selection, "spt", "--time-limit", 1)
+    assert (ended.code, "--time-limit: none of spt has a limit" in ended.err) == (2, True)
+    ended = run(*selection, "lst-search@evaluatons=3")
+    assert (ended.code, "did you mean 'evaluations'" in ended.err) == (2, True)

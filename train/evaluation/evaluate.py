@@ -26,6 +26,7 @@ from marl_sched.graph import VISIBLE_SHARE
 from marl_sched.problem import Problem, view_as_json
 from marl_sched.simulation import TurnSimulator
 from marl_sched.statistics import Summary, paired_difference, percent_gain, summarise
+from marl_sched.train.evaluation.gaps import by_instance, gaps
 
 SCHEMA = 2  # 1 named the horizon by its unit, as `hours`
 EXACT = "exact"  # the scheduler that the others' gap is taken to where it plays
@@ -35,6 +36,8 @@ _CHUNK_CELLS = 2048 * 41 * 16  # pairs of action and agent in flight: 2048 rows 
 
 Progress = Callable[[float], None]
 """Told the share of the work that is done, in [0, 1]."""
+Ended = Callable[[TurnSimulator, range], None]
+"""Given a simulator whose episodes are over; its row k is episode `rows[k] % episodes` of `rows[k] // episodes`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,11 +65,13 @@ def evaluate_scheduler(
     *,
     max_rows: int | None = None,
     progress: Progress | None = None,
+    ended: Ended | None = None,
 ) -> Scores:
     """Play the problem's episodes of every instance, many in lock-step, at most `max_rows` at a time.
 
     Envs never influence each other, so neither `max_rows` (default: as many as keep memory small) nor the
-    order of the instances changes a rule's scores; a network's logits differ in the last digits.
+    order of the instances changes a rule's scores; a network's logits differ in the last digits. `ended` is called
+    with every simulator whose episodes are over, and the numbers of its rows.
     """
     started = time.perf_counter()
     total = problem.count * problem.episodes
@@ -78,6 +83,8 @@ def evaluate_scheduler(
         simulator.reset(seed=problem.seed, episodes=[row % problem.episodes for row in rows])
         shares.begin(rows.start)
         play(scheduler, simulator, shares)
+        if ended is not None:
+            ended(simulator, rows)
         measures.append(simulator.objectives())
         per_round.append({**simulator.per_round(), **scheduler.per_round()})
     return Scores(
@@ -194,6 +201,7 @@ class Table:
             m1 = self._summary(scores.measures[problem.objective])
             data["reference"] = {"scheduler": name, "view": {"kind": "full"}, "M1": m1.as_json()}
         data["schedulers"] = {name: self._row(scores) for name, scores in self.scores.items()}
+        data["by_instance"] = by_instance(problem, self.scores)
         return data
 
     @property
@@ -213,8 +221,7 @@ class Table:
         for name, values in scores.per_round.items():
             row[name] = {"mean": _mean(values), **row.get(name, {}), "per_round": _by_round(values)}
         if EXACT in self.scores:
-            gap = percent_gain(m1, self.scores[EXACT].measures[objective])
-            row["gap_to_exact"] = self._summary(gap).as_json()
+            row |= gaps(scores, self.scores[EXACT], objective)
         difference = paired_difference(m1, self.baseline[2].measures[objective])
         row["difference"] = {"to": self.baseline[0], **difference.as_json()}
         row["visible_share"] = scores.visible_share
@@ -234,13 +241,15 @@ def evaluate(
     reference: Scheduler | None = None,
     baseline: str | None = None,
     progress: Callable[[str, float], None] | None = None,
+    ended: Callable[[str, TurnSimulator, range], None] | None = None,
 ) -> Table:
     """Play every scheduler and the reference on the same episodes.
 
     `reference` is what M2 is the gain over; it plays with the full view, and only once if it is in the table
     with that view already. `baseline` names one of the schedulers, which stands for itself under the view of
     the table; None is the reference under the full view, or the first scheduler where there is no reference.
-    `progress` is told a scheduler's name and the share of its work that is done. Raises UnknownNameError for
+    `progress` is told a scheduler's name and the share of its work that is done, `ended` its name and what
+    `evaluate_scheduler` tells. Raises UnknownNameError for
     a baseline that is not in the table.
     """
     if not schedulers:
@@ -250,7 +259,8 @@ def evaluate(
 
     def scores_of(name: str, scheduler: Scheduler, problem: Problem) -> Scores:
         report = None if progress is None else lambda done: progress(name, done)
-        return evaluate_scheduler(problem, scheduler, progress=report)
+        told = None if ended is None else lambda simulator, rows: ended(name, simulator, rows)
+        return evaluate_scheduler(problem, scheduler, progress=report, ended=told)
 
     scores = {name: scores_of(name, scheduler, problem) for name, scheduler in schedulers.items()}
     held_against = None

@@ -9,12 +9,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from marl_sched.agents.murse.dispatching import DISPATCHING_RULES, DispatchingRule, dispatched, priority, remaining
+from marl_sched.agents.murse.dispatching import (
+    DISPATCHING_RULES,
+    PRIORITY_RULES,
+    DispatchingRule,
+    dispatched,
+    priority,
+    remaining,
+    urgency_of,
+)
 from marl_sched.agents.murse.latest_start import successors
 from marl_sched.agents.murse.list_schedule import list_schedule
 from marl_sched.agents.murse.problem import Round, timed
 from marl_sched.agents.murse.schedulers import RULES
+from marl_sched.agents.playing import play
 from marl_sched.agents.registry import create_scheduler
+from marl_sched.envs.murse.simulator import MurseSimulator
 from marl_sched.errors import UnknownNameError
 from tests.agents.murse.playing import assert_confirmed, finished
 from tests.murse.problems import instances, problem
@@ -46,6 +56,17 @@ def test_rules_schedule_as_the_turns_of_the_simulator_do(instance, rule):
     assert np.array_equal(plan.finishes, turns.finishes)
 
 
+@settings(max_examples=100, deadline=None)
+@given(instances(), st.sampled_from([*PRIORITY_RULES, "lst", "genetic-edf", "edf-published"]))
+def test_a_round_that_is_played_whole_is_the_one_that_turns_play(instance, name):
+    turns = finished(create_scheduler(name, "murse"), [instance])
+    whole = play(create_scheduler(name, "murse"), MurseSimulator([instance]))
+    for k, result in enumerate(turns.round_results(0)):
+        assert whole.round_results(0)[k] == result
+        for field in ("agent", "start", "finish"):
+            assert np.array_equal(whole.state.executed[0, k][field], turns.state.executed[0, k][field])
+
+
 @settings(max_examples=60, deadline=None)
 @given(instances(), st.sampled_from(DISPATCHING_RULES), st.sampled_from(["plan", "online"]))
 def test_what_a_dispatching_rule_achieves_the_validator_confirms(instance, rule, mode):
@@ -62,13 +83,18 @@ def test_work_and_operations_remaining_count_every_task_behind_once():
 
 
 def test_rules_that_look_at_the_clock_rank_by_their_formulas():
-    # p 4, due at 20, weight 3, startable from 2, 8 units of work in 2 operations left, now 6, mean duration 5
-    case = (4.0, 20.0, 3.0, 2, 8.0, 2, 6, 5.0)
-    codes = {rule: code for code, rule in enumerate(DISPATCHING_RULES)}
-    assert priority(codes["slack-per-operation"], *case) == (20 - 6 - 8) / 2
-    assert priority(codes["atc"], *case) == pytest.approx(-3 / 4 * np.exp(-10 / (2 * 5)))
-    assert priority(codes["fifo"], *case) == 2.0
-    assert priority(codes["edd"], *case) == 20.0
+    # Task 1 lasts 4 with robot 1, weighs 3, has to end by 20 and task 2, of 4 units, waits for it and has no deadline:
+    # its latest finish is 20, 8 units of work in 2 operations remain, the mean duration is 4. Now 6, startable from 2.
+    whole = Round.of(problem([[4], [4]], waits=[(1, 0, 0)], deadlines=[20, 1000], weights=[3.0, 1.0]))
+
+    def value(rule: str) -> float:
+        return float(priority(urgency_of(whole, rule), 0, 0, 4, 2, 6))
+
+    assert value("slack-per-operation") == (20 - 6 - 8) / 2
+    assert value("atc") == pytest.approx(-3 / 4 * np.exp(-10 / (2 * 4)))
+    assert value("fifo") == 2.0
+    assert (value("edd"), value("edf"), value("hctf")) == (20.0, 20.0, -3.0)
+    assert (value("mwkr"), value("mopnr"), value("wspt")) == (-8.0, -2.0, -3 / 4)
 
 
 def test_first_in_first_out_takes_what_has_been_startable_for_longest():
