@@ -41,7 +41,8 @@ def print_scores(results: dict[str, Any], style: str = "table", *, stderr: bool 
         return
     if style == "csv":
         rows = [_flat_row(results, name, row) for name, row in _best_first(results)]
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        columns = list(dict.fromkeys(column for row in rows for column in row))  # solvers have more of them
+        writer = csv.DictWriter(file, columns, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
         return
