@@ -24,6 +24,7 @@ from marl_sched.agents.murse.problem import Round, timed
 from marl_sched.agents.murse.schedulers import RULES
 from marl_sched.agents.playing import play
 from marl_sched.agents.registry import create_scheduler
+from marl_sched.envs.murse.instance import INELIGIBLE
 from marl_sched.envs.murse.simulator import MurseSimulator
 from marl_sched.errors import UnknownNameError
 from tests.agents.murse.playing import assert_confirmed, finished
@@ -135,7 +136,7 @@ def test_a_schedule_of_a_shop_of_two_thousand_operations_is_consistent(rule):
 def shop(n_jobs: int, n_machines: int, seed: int) -> Round:
     """A job shop of one operation per job and machine, in random order, of 1 to 99 units."""
     rng, n = np.random.default_rng(seed), n_jobs * n_machines
-    durations, lags = np.zeros((n, n_machines), np.int64), np.full((n, n), -1, np.int64)
+    durations, lags = np.full((n, n_machines), INELIGIBLE, np.int64), np.full((n, n), -1, np.int64)
     for job in range(n_jobs):
         for place, machine in enumerate(rng.permutation(n_machines)):
             operation = job * n_machines + place
