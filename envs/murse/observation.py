@@ -169,7 +169,7 @@ def see_tasks(state: State, b: int, viewer: int, sight: Sight, out: Arrays) -> n
         describe_task(features, job, row.high, row.clock, x, y)
         describe_durations(features, pairs, viewer, sight.heard, row.high)
         unheeded = describe_waits(out.task[b], task, lags, taken[:count], sight.seen[:n])
-        startable[task] = not sight.known[task] and pairs[viewer].true > 0 and unheeded == 0
+        startable[task] = not sight.known[task] and pairs[viewer].true >= 0 and unheeded == 0
         if sight.known[task]:
             describe_commitment(features, sight.start[task] - row.clock, sight.finish[task] - row.clock, row.high)
             features[MINE] = job.agent == viewer
