@@ -113,8 +113,8 @@ def test_vectorised_environments_without_a_seed_are_not_alike(domain):
 def test_the_trainers_instances_are_neither_validated_nor_evaluated_on():
     pytest.importorskip("torchrl")
     from marl_sched.domain import get_domain
-    from marl_sched.train.collect import InstanceSource
     from marl_sched.train.config import load_config
+    from marl_sched.train.environment import InstanceSource
     from marl_sched.train.validation import Validation
 
     domain, seed = get_domain("airme"), 3
