@@ -25,7 +25,7 @@ that knows no mask; what they choose wrongly does nothing and is marked `illegal
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -70,7 +70,7 @@ class SchedulingTorchRL(SavesState, EnvBase):
     """
 
     batch_locked = True
-    changing = ("_seed", "_count")
+    changing: ClassVar[tuple[str, ...]] = ("_seed", "_count")
 
     def __init__(
         self,
