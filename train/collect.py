@@ -328,6 +328,14 @@ class RayCollector(WorkerCollector):
         options = {**self._options(), "total_frames": _NO_LIMIT**2}  # it takes -1 for none at all
         return TorchRLRay(self._factories(), actor(module), sync=True, **options)
 
+    def _synchronise(self, module: ActingLogits) -> None:
+        """Send the parameters, which workers begin with, from the second update on.
+
+        By then workers have started, which takes longer than the connection waits.
+        """
+        if self._updates > 1:
+            super()._synchronise(module)
+
 
 def segment_collector(task: TrainingTask, name: CollectorName, workers: int) -> SegmentCollector:
     """The collector of that name."""
