@@ -48,7 +48,7 @@ def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
         return functools.partial(kernel, **options)
     dispatcher: Any = numba.njit(**options)(function)
     if isinstance(dispatcher, Dispatcher):  # with NUMBA_DISABLE_JIT it is the plain function
-        dispatcher._cache = _cache_of(function)
+        setattr(dispatcher, "_cache", _cache_of(function))  # noqa: B010  (not in Numba's stubs)
     return dispatcher
 
 

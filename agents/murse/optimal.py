@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TypedDict
+
 import numpy as np
 
 from marl_sched.agents.murse.best_rule import best_rule_plan
@@ -16,6 +18,14 @@ from marl_sched.simulation import TurnSimulator
 
 _ROLLING_WORK_LIMIT = 2.0  # deterministic seconds per new plan
 SOLVER_MEASURES = ("bound", "optimal", "timed_out", "without_plan", "solver_seconds")
+
+
+class Limits(TypedDict):
+    """What ends a solver's search: seconds, units of deterministic work, and how many threads share it."""
+
+    time_limit: float | None
+    work_limit: float | None
+    threads: int
 
 
 class ExactScheduler(PlanningScheduler):
@@ -37,7 +47,7 @@ class ExactScheduler(PlanningScheduler):
         require_limits(self.name, work_limit, time_limit, threads)
         if time_limit is None and work_limit is None:
             work_limit = self.default_work_limit
-        self._limits = {"time_limit": time_limit, "work_limit": work_limit, "threads": threads}
+        self._limits = Limits(time_limit=time_limit, work_limit=work_limit, threads=threads)
         self.solutions: dict[tuple[int, int], Solution] = {}
         self._measures = {name: np.zeros((0, 0)) for name in SOLVER_MEASURES}
 
