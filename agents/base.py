@@ -141,6 +141,18 @@ class AdvantageScheduler(ObservationScheduler):
         """
 
 
+class CostScheduler(Scheduler):
+    """A scheduler that works out what every choice would cost the team, so that a policy can learn from it."""
+
+    @abstractmethod
+    def costs(self, simulator: TurnSimulator, legal: np.ndarray) -> np.ndarray:
+        """What the acting agents' choices cost, float64 (B, n_actions); inf for those that are not to be made.
+
+        `legal` int8 (B, n_actions) are the acting agents' action masks under the simulator's view. Rows that are
+        over hold anything.
+        """
+
+
 def best_action(score: np.ndarray, eligible: np.ndarray) -> np.ndarray:
     """The eligible action with the highest score, ties to the lowest index, 0 where none is eligible.
 

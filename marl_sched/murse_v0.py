@@ -40,15 +40,15 @@ Hidden and padded nodes are zero and leave the masks. Durations and times are in
 
 | array | shape | dtype | meaning |
 |---|---|---|---|
-| `task` | (N + 2, 23) | float32 | status, durations, deadline, earliest and believed times, waits, distance |
+| `task` | (N + 2, 36) | float32 | status, durations, deadline, believed times, waits, distance, looking ahead |
 | `task_mask` | (N + 2,) | int8 | the task exists and is visible |
-| `agent` | (A, 7) | float32 | robot or human, acting, when free, share of tasks, distance |
+| `agent` | (A, 9) | float32 | robot or human, acting, when free, share of tasks, distance, price, planned end |
 | `agent_mask` | (A,) | int8 | the agent exists and is heard |
 | `location` | (N, 3) | float32 | shares of the visible tasks there |
 | `location_mask` | (N,) | int8 | a visible task is there |
-| `state` | (9,) | float32 | shares and means over what is visible, clock, round |
+| `state` | (11,) | float32 | shares and means over what is visible, clock, round, planned end and lateness |
 | `temporal`, `aug` | (N + 2, N + 2) | int8 | temporal network on starts, and reversed; `_attributes`: bounds |
-| `take_time` | (A, N + 2) | int8 | eligible pairs; `_attributes`: estimate and its spread |
+| `take_time` | (A, N + 2) | int8 | eligible pairs; `_attributes`: estimate, spread, finish, regret, reduced cost |
 | `use_time` | (N + 2, A) | int8 | the same the other way round |
 | `assigned_to`, `located_in` | (N + 2,) | int64 | agent and location of a task, -1: none or unknown |
 | `near` | (N, N) | int8 | locations too close for work at the same time |

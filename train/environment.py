@@ -4,6 +4,7 @@ Beside what `SchedulingTorchRL` gives, the tensordict holds
 
     progress     (B,)            int64    how far the episode has come, in the domain's unit
     central      nested          the observation's arrays under the full view, for a critic or a teacher; optional
+    costs        (B, n_actions)  float64  what a teacher says that each choice costs (agents.base); optional
     memory       (B, M, size)    float32  what a recurrent policy carries (marl_sched.agents.base); optional
 
 An episode is cut (`truncated`) when its length has passed, which the curriculum gives at the row's reset. Everything
@@ -22,6 +23,8 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.data import Composite, Unbounded
 
+from marl_sched.agents.base import CostScheduler
+from marl_sched.agents.registry import create_scheduler
 from marl_sched.domain import Domain, get_domain
 from marl_sched.envs.api.torchrl_env import SchedulingTorchRL
 from marl_sched.errors import InvalidOptionError
@@ -30,7 +33,7 @@ from marl_sched.noise import instance_generator
 from marl_sched.simulation import SavedState
 from marl_sched.train.curriculum import EpisodeLength
 
-CENTRAL, MEMORY = "central", "memory"
+CENTRAL, COSTS, MEMORY = "central", "costs", "memory"
 
 
 class InstanceSource:
@@ -65,6 +68,7 @@ class TrainingTask:
             update, and their first episodes are cut at different times, so that from then on every part of an episode
             is in every update.
         central: give the full view beside the agents' own.
+        teacher: name of a CostScheduler that is asked in every turn; "": nobody is.
         memory: (M, size) of a recurrent policy's memory, see marl_sched.agents.base.
         skip: episodes of each row that are left out, as those that a run had begun before it was stopped.
     """
@@ -80,6 +84,7 @@ class TrainingTask:
     length: EpisodeLength
     turns: int | None = None
     central: bool = False
+    teacher: str = ""
     memory: tuple[int, int] = (0, 0)
     skip: int = 0
 
@@ -105,6 +110,7 @@ class TrainingEnv(SchedulingTorchRL):
         self._steps, self._resumes = 0, False  # steps of every row; whether the next reset begins nothing
         self._cut = np.zeros(rows, np.int64)  # where each row's episode is cut, in the domain's unit
         self._memory = torch.zeros(rows, *task.memory)
+        self._teacher = cost_teacher(task.teacher, domain) if task.teacher else None
         source = InstanceSource(domain, task.scales, seed=task.seed, rows=task.rows, episodes=task.episodes)
         super().__init__(
             domain,
@@ -127,6 +133,9 @@ class TrainingEnv(SchedulingTorchRL):
             self.observation_spec[CENTRAL] = Composite(
                 {n: self.observation_spec[n].clone() for n in names}, shape=batch
             )
+        if self._teacher is not None:
+            shape = (*batch, self.simulator.max_actions)
+            self.observation_spec[COSTS] = Unbounded(shape, dtype=torch.float64)
         if self.task.memory[1]:
             self.observation_spec[MEMORY] = Unbounded((*batch, *self.task.memory), dtype=torch.float32)
 
@@ -194,9 +203,21 @@ class TrainingEnv(SchedulingTorchRL):
             central = self.simulator.observe_all()
             central[ACTION_MASK] = central[ACTION_MASK] != 0
             out[CENTRAL] = {name: torch.from_numpy(array) for name, array in central.items()}
+        if self._teacher is not None:
+            out[COSTS] = torch.from_numpy(self._teacher.costs(self.simulator, self._mask.astype(np.int8)))
         if self.task.memory[1]:
             out[MEMORY] = self._memory
         return out
+
+
+def cost_teacher(name: str, domain: Domain) -> CostScheduler:
+    """The scheduler of that name; InvalidOptionError for one that cannot say what choices cost."""
+    teacher = create_scheduler(name, domain)
+    if not isinstance(teacher, CostScheduler):
+        raise InvalidOptionError(
+            f"train: algorithm.teacher: expected a scheduler that works out what every choice costs, got {name}"
+        )
+    return teacher
 
 
 def _as_bytes(array: np.ndarray) -> np.ndarray:

@@ -24,6 +24,7 @@ from marl_sched.envs.murse.graph import (
     MY_SPREAD,
     N_AGENT,
     N_LOCATION,
+    N_PAIR,
     N_STATE,
     N_TASK,
     PLACEHOLDER,
@@ -36,6 +37,7 @@ from marl_sched.envs.murse.graph import (
     Arrays,
 )
 from marl_sched.envs.murse.instance import NO_DEADLINE
+from marl_sched.envs.murse.lookahead import new_outlook, see_ahead
 from marl_sched.envs.murse.network import network_of, simplified_bounds
 from marl_sched.envs.murse.rules import Rules
 from marl_sched.envs.murse.state import NEVER, NOBODY, State
@@ -50,7 +52,7 @@ from marl_sched.temporal_network import UNBOUNDED, close
 def observe(state: State, rules: Rules, agents: np.ndarray, sensing: float, comm: float, out: Arrays) -> None:
     """Write what each row's agent, int64 (B,), sees; a negative agent sees nothing."""
     require_fitting(state, agents, out)
-    sight = new_sight(state)
+    sight, outlook = new_sight(state), new_outlook(state)
     for b in range(len(agents)):
         clear(out, b)
         out.action_mask[b, 0] = 1
@@ -67,6 +69,7 @@ def observe(state: State, rules: Rules, agents: np.ndarray, sensing: float, comm
         summarise(state, b, sight, out)
         if state.agents[b, viewer].free_at <= state.rows[b].clock and state.rows[b].acting != NOBODY:
             write_action_mask(startable, b, out)
+        see_ahead(state, b, viewer, sight, outlook, out)
 
 
 @kernel
@@ -81,8 +84,8 @@ def require_fitting(state: State, agents: np.ndarray, out: Arrays) -> None:
     fit &= out.near.shape == (batch, n, n) and out.state.shape == (batch, N_STATE)
     fit &= out.temporal.shape == edges and out.temporal_attributes.shape == (batch, n + 2, n + 2, 1)
     fit &= len(out.aug) == 0 or (out.aug.shape == edges and out.aug_attributes.shape == out.temporal_attributes.shape)
-    fit &= out.take_time.shape == (batch, m, n + 2) and out.take_time_attributes.shape == (batch, m, n + 2, 2)
-    fit &= out.use_time.shape == (batch, n + 2, m) and out.use_time_attributes.shape == (batch, n + 2, m, 2)
+    fit &= out.take_time.shape == (batch, m, n + 2) and out.take_time_attributes.shape == (batch, m, n + 2, N_PAIR)
+    fit &= out.use_time.shape == (batch, n + 2, m) and out.use_time_attributes.shape == (batch, n + 2, m, N_PAIR)
     if not fit or out.time.shape != (batch,) or out.visible_share.shape != (batch,):
         raise InvalidOptionError("out: expected arrays of the shapes that new_observation() makes")
     for b in range(batch):

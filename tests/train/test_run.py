@@ -37,6 +37,12 @@ IMITATION = [
     "algorithm=imitation", *(word for word in TINY if ".ppo." not in word), "algorithm.instances=4",
     "algorithm.turns=12", "algorithm.minibatch=16",
 ]  # fmt: skip
+ROLLOUT_IMITATION = [
+    "env=murse", "policy=residual", "algorithm=rollout_imitation", "curriculum=rounds", "env.scales=[small]",
+    "policy.width=2", "policy.heads=2", "policy.hidden=4", "algorithm.instances=4", "algorithm.turns=12",
+    "algorithm.minibatch=16", "updates=4", "save_every=2", "validation.every=2", "validation.instances=2",
+    "validation.length=1",
+]  # fmt: skip
 
 
 class StoppedError(Exception):
@@ -69,8 +75,16 @@ def rows(directory: Path) -> list[dict[str, str]]:
 
 @pytest.mark.parametrize(
     "overrides",
-    [GAE, STEP_BASELINE, IPPO, STATE_VALUE, RANDOM_VIEW, pytest.param(IMITATION, marks=pytest.mark.slow)],
-    ids=["gae", "step_baseline", "ippo", "state_value", "random view", "imitation"],
+    [
+        GAE,
+        STEP_BASELINE,
+        IPPO,
+        STATE_VALUE,
+        RANDOM_VIEW,
+        pytest.param(IMITATION, marks=pytest.mark.slow),
+        pytest.param(ROLLOUT_IMITATION, marks=pytest.mark.slow),
+    ],
+    ids=["gae", "step_baseline", "ippo", "state_value", "random view", "imitation", "rollout_imitation"],
 )
 def test_a_resumed_run_ends_as_one_that_never_stopped(
     overrides: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -64,9 +64,9 @@ class Setup:
             )
         return self._task(rows=rows, episodes=episodes)
 
-    def segments(self, *, rows: int, turns: int, central: bool) -> SegmentCollector:
-        """A collector of `turns` turns of every row for each update."""
-        task = self._task(rows=rows, turns=turns, central=central)
+    def segments(self, *, rows: int, turns: int, central: bool, teacher: str = "") -> SegmentCollector:
+        """A collector of `turns` turns of every row for each update; see TrainingTask."""
+        task = self._task(rows=rows, turns=turns, central=central, teacher=teacher)
         return segment_collector(task, self.config.collector.name, self.config.collector.workers)
 
     def _task(self, **options: Any) -> TrainingTask:

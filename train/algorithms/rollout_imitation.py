@@ -1,0 +1,153 @@
+"""Imitation learning from a scheduler that works out what every choice costs.
+
+The policy that learns also plays, so that it meets its own mistakes (DAgger; Ross et al. 2011). In every state that it
+comes to, the teacher says what each choice costs the team if it goes on by the teacher's rule. An excess cost is its
+share above the least one. By the criterion `cross_entropy` the policy learns the distribution
+softmax(-excess / temperature) over legal actions: choices of the same cost are all right.
+
+What a roll-out costs depends on details that no network can foresee, so that the likeliest best choice need not be the
+one of the least cost on average. The criterion `expected_cost` minimises that, sum over a of pi(a) excess(a) less
+temperature x entropy (AggreVaTeD; Sun et al. 2017).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import numpy as np
+import torch
+from msgspec import Meta, Struct
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from marl_sched.agents.networks.network import PolicyNetwork
+from marl_sched.agents.registry import create_scheduler
+from marl_sched.train.algorithms.base import NAME, AlgorithmConfig, Setup
+from marl_sched.train.algorithms.imitation import cross_entropy, expected_advantage
+from marl_sched.train.bounds import Count, NonNegative, Positive
+from marl_sched.train.collect import Collector, Rollout
+from marl_sched.train.device import device_of
+from marl_sched.train.environment import COSTS
+from marl_sched.train.learner import Learner
+from marl_sched.train.ppo import between, importance_subsample, means, minibatches
+
+if TYPE_CHECKING:
+    from marl_sched.train.config import TrainConfig
+
+WORST = 0.5
+"""The excess cost that a choice counts with at most, except by cross-entropy."""
+
+
+class RolloutImitationConfig(
+    AlgorithmConfig,
+    Struct,
+    frozen=True,
+    kw_only=True,
+    forbid_unknown_fields=True,
+    tag_field=NAME,
+    tag="rollout_imitation",
+):
+    """Choices whose costs a teacher works out; temperature and learning rate change linearly.
+
+    Rows play on from update to update, `turns` turns each, with the policy that learns.
+    """
+
+    instances: Count
+    turns: Count
+    teacher: str
+    criterion: Literal["cross_entropy", "expected_cost"]
+    epochs: Count
+    minibatch: Count
+    learning_rate: Positive
+    final_learning_rate: NonNegative
+    temperature: Positive
+    final_temperature: Positive
+    max_grad_norm: Positive
+    min_keep_prob: Annotated[float, Meta(gt=0, le=1)]
+
+    def build(self, setup: Setup) -> tuple[Collector, Learner]:
+        """See AlgorithmConfig; raises InvalidOptionError for a scheduler that cannot teach."""
+        collector = setup.segments(rows=self.instances, turns=self.turns, central=False, teacher=self.teacher)
+        return collector, RolloutImitation(setup.policy(collector.env), self)
+
+    def knowledge(self, config: TrainConfig) -> list[str]:
+        """The teacher's."""
+        teacher = create_scheduler(self.teacher, config.env.name)
+        known = f" ({teacher.privileged_info})" if teacher.privileged_info else ""
+        return [f"imitation of {teacher.name}{known}"]
+
+
+class RolloutImitation:
+    """Learns what choices cost least.
+
+    Args:
+        policy: observation -> logits (N, n_actions).
+        config: see RolloutImitationConfig.
+    """
+
+    def __init__(self, policy: PolicyNetwork, config: RolloutImitationConfig) -> None:
+        self.policy, self._config = policy, config
+        self.modules: dict[str, nn.Module] = {"policy": policy}
+        self.optimizer = torch.optim.Adam(policy.parameters(), fused=True)
+
+    def learn(self, rollout: Rollout, progress: float, rng: np.random.Generator) -> dict[str, float]:
+        """Take gradient steps on the turns that are kept."""
+        config, device = self._config, device_of(self.policy)
+        samples = self._samples(rollout, rng).to(device)
+        temperature = between(config.temperature, config.final_temperature, progress)
+        for group in self.optimizer.param_groups:
+            group["lr"] = between(config.learning_rate, config.final_learning_rate, progress)
+        reports = [
+            self._step(samples[indices.to(device)], temperature)
+            for indices in minibatches(samples.shape[0], config.minibatch, config.epochs, rng)
+        ]
+        names = ("policy_loss", "regret", "entropy", "gradient")
+        return dict(zip(names, means(reports), strict=True))
+
+    def _samples(self, rollout: Rollout, rng: np.random.Generator) -> TensorDict:
+        samples, names, (turn, row) = importance_subsample(
+            self.policy, rollout, rollout.valid, self._config.min_keep_prob, rng
+        )
+        samples["excess"] = excess_costs(rollout.data[COSTS][row, turn]).gather(1, names)
+        return samples
+
+    def _step(self, batch: TensorDict, temperature: float) -> Tensor:
+        share = batch["weight"] / batch["weight"].sum()
+        log_probs = self.policy(batch).log_softmax(-1)
+        if self._config.criterion == "cross_entropy":
+            losses = cross_entropy(log_probs, (-batch["excess"] / temperature).softmax(-1))
+        else:
+            losses = -expected_advantage(log_probs, -batch["excess"].clamp(max=WORST), temperature)
+        loss = share @ losses
+        self.optimizer.zero_grad()
+        loss.backward()
+        norm = nn.utils.clip_grad_norm_(self.policy.parameters(), self._config.max_grad_norm)
+        self.optimizer.step()
+        with torch.no_grad():
+            probs = log_probs.exp()
+            regret = share @ (probs * batch["excess"].clamp(max=WORST)).sum(-1)
+            entropy = share @ cross_entropy(log_probs, probs)
+            return torch.stack([loss, regret, entropy, norm])
+
+    def state(self) -> dict[str, float | None]:
+        """Nothing."""
+        return {}
+
+    def restore(self, state: dict[str, float | None]) -> None:
+        """Nothing."""
+
+
+def excess_costs(costs: Tensor) -> Tensor:
+    """Costs, float64 (N, n_actions), as shares above the least of each row, float32; inf stays inf.
+
+    Where all are inf, as in a state in which the agent can only wait for nothing, action 0 has the least.
+    """
+    costs = torch.where(torch.isfinite(costs).any(1, keepdim=True), costs, _only_waiting(costs))
+    least = costs.min(1, keepdim=True).values
+    return ((costs - least) / least.clamp(min=1.0)).float()
+
+
+def _only_waiting(costs: Tensor) -> Tensor:
+    waiting = torch.full_like(costs, torch.inf)
+    waiting[:, 0] = 1.0
+    return waiting
