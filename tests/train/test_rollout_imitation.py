@@ -12,7 +12,7 @@ from marl_sched.train.algorithms.rollout_imitation import excess_costs
 from marl_sched.train.run import train_from_overrides
 
 TINY = [
-    "env=murse", "policy=residual", "algorithm=rollout_imitation", "curriculum=rounds", "env.scales=[small]",
+    "env=murse", "policy=hetgat_residual", "algorithm=rollout_imitation", "curriculum=rounds", "env.scales=[small]",
     "policy.width=4", "policy.heads=2", "policy.hidden=16", "algorithm.instances=8", "algorithm.turns=8",
     "validation.every=4", "validation.instances=2", "validation.length=1", "save_every=2", "threads=1",
 ]  # fmt: skip

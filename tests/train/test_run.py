@@ -38,7 +38,7 @@ IMITATION = [
     "algorithm.turns=12", "algorithm.minibatch=16",
 ]  # fmt: skip
 ROLLOUT_IMITATION = [
-    "env=murse", "policy=residual", "algorithm=rollout_imitation", "curriculum=rounds", "env.scales=[small]",
+    "env=murse", "policy=hetgat_residual", "algorithm=rollout_imitation", "curriculum=rounds", "env.scales=[small]",
     "policy.width=2", "policy.heads=2", "policy.hidden=4", "algorithm.instances=4", "algorithm.turns=12",
     "algorithm.minibatch=16", "updates=4", "save_every=2", "validation.every=2", "validation.instances=2",
     "validation.length=1",
