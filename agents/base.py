@@ -73,8 +73,8 @@ class Scheduler(ABC):
     simulator_options: Mapping[str, Any] = MappingProxyType({})
     heeds_objective: bool = True
 
-    def start(self, simulator: TurnSimulator, rows: np.ndarray) -> None:
-        """Called after `rows`, bool (B,), began a new episode; planners make their plans here."""
+    def start(self, simulator: TurnSimulator, envs: np.ndarray) -> None:
+        """Called after `envs`, bool (B,), began a new episode; planners make their plans here."""
 
     def per_round(self) -> dict[str, np.ndarray]:
         """What the scheduler counted of itself, such as messages: name -> float64 (B, rounds); mostly nothing."""

@@ -44,13 +44,13 @@ class RecurrentScheduler(Scheduler):
         From batched observations, memories float32 (B, memory_size) and uniforms float64 (B,) in [0, 1).
         """
 
-    def start(self, simulator: TurnSimulator, rows: np.ndarray) -> None:
-        """Give the agents of `rows`, bool (B,), their initial memories."""
+    def start(self, simulator: TurnSimulator, envs: np.ndarray) -> None:
+        """Give the agents of `envs`, bool (B,), their initial memories."""
         shape = (simulator.batch, simulator.max_agents, self.memory_size)
         if self._memories is None or self._memories.shape != shape:
             self._memories = np.zeros(shape, np.float32)
-        initial = self.initial_memory(int(rows.sum()) * simulator.max_agents)
-        self._memories[rows] = initial.reshape(-1, simulator.max_agents, self.memory_size)
+        initial = self.initial_memory(int(envs.sum()) * simulator.max_agents)
+        self._memories[envs] = initial.reshape(-1, simulator.max_agents, self.memory_size)
 
     def decide(self, simulator: TurnSimulator) -> np.ndarray:
         """Observe for every acting agent under the simulator's view, choose, and keep what it remembers."""

@@ -35,8 +35,8 @@ class Objective(Protocol):
 
     parts: tuple[str, ...]
 
-    def start(self, simulator: TurnSimulator, rows: np.ndarray) -> None:
-        """Called after `rows`, bool (B,), began a new episode."""
+    def start(self, simulator: TurnSimulator, envs: np.ndarray) -> None:
+        """Called after `envs`, bool (B,), began a new episode."""
 
     def total(self, simulator: TurnSimulator) -> np.ndarray:
         """The reward of each env's episode so far, part by part, float64 (B, len(parts))."""
@@ -84,22 +84,22 @@ class ScoredSimulator(TurnSimulator):
             raise AttributeError(f"{name}: an objective from outside is paid turn by turn, expected step()")
         return getattr(self.inner, name)
 
-    def _begin(self, rows: np.ndarray) -> None:
-        self._objective.start(self.inner, rows)
-        self.reward[rows] = self.rewards[rows] = 0.0
-        self._paid = np.where(rows[:, None], self._objective.total(self.inner), self._paid)
+    def _begin(self, envs: np.ndarray) -> None:
+        self._objective.start(self.inner, envs)
+        self.reward[envs] = self.rewards[envs] = 0.0
+        self._paid = np.where(envs[:, None], self._objective.total(self.inner), self._paid)
 
     def reset(
         self,
-        rows: np.ndarray | None = None,
+        envs: np.ndarray | None = None,
         *,
         seed: int | None = None,
         instances: Sequence[Any] | None = None,
         episodes: Sequence[int] | None = None,
     ) -> None:
         """Start new episodes; see TurnSimulator.reset."""
-        self.inner.reset(rows, seed=seed, instances=instances, episodes=episodes)
-        self._begin(np.ones(self.inner.batch, np.bool_) if rows is None else np.asarray(rows, np.bool_))
+        self.inner.reset(envs, seed=seed, instances=instances, episodes=episodes)
+        self._begin(np.ones(self.inner.batch, np.bool_) if envs is None else np.asarray(envs, np.bool_))
 
     def step(self, actions: np.ndarray) -> None:
         """Take one turn in every env, and pay what the objective grew by."""
@@ -117,9 +117,9 @@ class ScoredSimulator(TurnSimulator):
         """What the domain's simulator shows under the full view."""
         return self.inner.observe_all()
 
-    def free_agents(self, row: int) -> np.ndarray:
+    def free_agents(self, env_index: int) -> np.ndarray:
         """As the domain's simulator."""
-        return self.inner.free_agents(row)
+        return self.inner.free_agents(env_index)
 
     def objectives(self) -> dict[str, np.ndarray]:
         """The domain's measures, then the objective's, per unit of the episode; one for each of several parts."""
@@ -132,9 +132,13 @@ class ScoredSimulator(TurnSimulator):
         """As the domain's simulator."""
         return self.inner.per_round()
 
-    def snapshot(self, row: int) -> dict[str, np.ndarray]:
+    def snapshot(self, env_index: int) -> dict[str, np.ndarray]:
         """The domain's state, and what was paid."""
-        return {**self.inner.snapshot(row), "paid": self._paid[row].copy(), "reward_paid": self.reward[row].copy()}
+        return {
+            **self.inner.snapshot(env_index),
+            "paid": self._paid[env_index].copy(),
+            "reward_paid": self.reward[env_index].copy(),
+        }
 
     @property
     def reward_parts(self) -> Mapping[str, np.ndarray]:

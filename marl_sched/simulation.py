@@ -86,13 +86,13 @@ class TurnSimulator(ABC):
     @abstractmethod
     def reset(
         self,
-        rows: np.ndarray | None = None,
+        envs: np.ndarray | None = None,
         *,
         seed: int | None = None,
         instances: Sequence[Any] | None = None,
         episodes: Sequence[int] | None = None,
     ) -> None:
-        """Start a new episode in `rows` (bool (B,), all if None).
+        """Start a new episode in `envs` (bool (B,), all if None).
 
         With a seed the rows start episode 0 of that seed, without one the next episode of theirs; `episodes`,
         one number for each chosen row in order, says otherwise (rows that share an instance need it).
@@ -137,17 +137,17 @@ class TurnSimulator(ABC):
         return rows, observation
 
     @abstractmethod
-    def free_agents(self, row: int) -> np.ndarray:
-        """The agents, int64, that have still to act at this decision epoch in `row`, in turn order."""
+    def free_agents(self, env_index: int) -> np.ndarray:
+        """The agents, int64, that have still to act at this decision epoch in `env_index`, in turn order."""
 
-    def give_turn(self, row: int, agent: int) -> None:
+    def give_turn(self, env_index: int, agent: int) -> None:
         """Let an agent that has still to act at this decision epoch act next; the others follow in turn order.
 
         Raises IllegalActionError for an agent that has no turn left.
         """
-        if agent not in self.free_agents(row):
-            raise IllegalActionError(f"row {row}: agent {agent} has no turn at time {self.time[row]}")
-        self.acting[row] = agent
+        if agent not in self.free_agents(env_index):
+            raise IllegalActionError(f"row {env_index}: agent {agent} has no turn at time {self.time[env_index]}")
+        self.acting[env_index] = agent
 
     @abstractmethod
     def objectives(self) -> dict[str, np.ndarray]:
@@ -203,7 +203,7 @@ class TurnSimulator(ABC):
         return {}
 
     @abstractmethod
-    def snapshot(self, row: int) -> dict[str, np.ndarray]:
+    def snapshot(self, env_index: int) -> dict[str, np.ndarray]:
         """Copies of all arrays of one row's true state, for traces, rendering and bit-equality tests."""
 
     def live_arrays(self) -> dict[str, np.ndarray]:

@@ -117,7 +117,7 @@ class ModelBasedRule(PriorityRule):
         )
         self._types, self._failure = tuple(types), failure
 
-    def start(self, simulator: TurnSimulator, rows: np.ndarray) -> None:
+    def start(self, simulator: TurnSimulator, envs: np.ndarray) -> None:
         """Know the simulator's types and failure model."""
         of = cast(AirmeSimulator, simulator)
         self._types, self._failure = of.types, of.failure

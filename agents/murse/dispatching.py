@@ -270,15 +270,15 @@ class DispatchingRule(PlanningScheduler):
         super().__init__()
         self.name = require("dispatching rule", rule, DISPATCHING_RULES)
 
-    def plan(self, simulator: MurseSimulator, row: int) -> Plan:
+    def plan(self, simulator: MurseSimulator, env_index: int) -> Plan:
         """The rule's schedule of the whole round on estimated durations."""
-        return dispatched(estimated_round(simulator, row), self.name)
+        return dispatched(estimated_round(simulator, env_index), self.name)
 
-    def revise(self, simulator: MurseSimulator, row: int, plan: Plan) -> Plan:
+    def revise(self, simulator: MurseSimulator, env_index: int, plan: Plan) -> Plan:
         """The rule's schedule of what is left, where something went otherwise."""
         if simulator.mode == "plan":
             return plan
-        problem = remaining_round(simulator, row)
+        problem = remaining_round(simulator, env_index)
         return plan if as_expected(problem, plan) else dispatched(problem, self.name)
 
 

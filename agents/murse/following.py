@@ -30,18 +30,18 @@ class PlanningScheduler(Scheduler):
         self._plans: list[Plan | None] = []
 
     @abstractmethod
-    def plan(self, simulator: MurseSimulator, row: int) -> Plan:
+    def plan(self, simulator: MurseSimulator, env_index: int) -> Plan:
         """A plan for the present round of a row, whose first turn it is."""
 
-    def revise(self, simulator: MurseSimulator, row: int, plan: Plan) -> Plan:
+    def revise(self, simulator: MurseSimulator, env_index: int, plan: Plan) -> Plan:
         """The plan to go on with, asked before every turn but a round's first; by default the same."""
         return plan
 
-    def start(self, simulator: TurnSimulator, rows: np.ndarray) -> None:
+    def start(self, simulator: TurnSimulator, envs: np.ndarray) -> None:
         """Forget the rows' plans; new ones are made at their next turns."""
         if len(self._rounds) != simulator.batch:
             self._rounds, self._plans = np.full(simulator.batch, -1), [None] * simulator.batch
-        self._rounds[rows] = -1
+        self._rounds[envs] = -1
 
     def epoch_player(self, simulator: TurnSimulator) -> EpochPlayer | None:
         """Plays each plan as a whole round where nothing can be revised in between."""
@@ -63,15 +63,15 @@ class PlanningScheduler(Scheduler):
         return actions
 
 
-def next_action(simulator: MurseSimulator, row: int, plan: Plan) -> int:
+def next_action(simulator: MurseSimulator, env_index: int, plan: Plan) -> int:
     """The acting agent's next action by the plan: the slot of its next task, or 0 while that has to wait."""
-    agent = int(simulator.acting[row])
-    done = simulator.state.tasks["agent"][row] != NOBODY
+    agent = int(simulator.acting[env_index])
+    done = simulator.state.tasks["agent"][env_index] != NOBODY
     own = plan.tasks[(plan.agents == agent) & ~done[plan.tasks]]
     if len(own) == 0:
         return 0
     task = int(own[0])
     place = int(np.flatnonzero(plan.tasks == task)[0])
     ahead = plan.tasks[:place]
-    held = simulator.state.near[row, task, ahead] & ~done[ahead]
-    return 0 if held.any() or not simulator.dispatchable(row, task, agent) else task + 1
+    held = simulator.state.near[env_index, task, ahead] & ~done[ahead]
+    return 0 if held.any() or not simulator.dispatchable(env_index, task, agent) else task + 1

@@ -27,11 +27,11 @@ class GeneticEdf(PlanningScheduler):
                 raise InvalidOptionError(f"{self.name}: {name}: expected an integer >= 1, got {value}")
         self.options = generations, baselines, mutations
 
-    def plan(self, simulator: MurseSimulator, row: int) -> Plan:
+    def plan(self, simulator: MurseSimulator, env_index: int) -> Plan:
         """The best schedule found; its randomness is that of the row's episode and round."""
         rows = simulator.state.rows
-        rng = np.random.default_rng([int(rows["episode"][row]), int(rows["round"][row])])
-        return self.evolved(estimated_round(simulator, row), rng)
+        rng = np.random.default_rng([int(rows["episode"][env_index]), int(rows["round"][env_index])])
+        return self.evolved(estimated_round(simulator, env_index), rng)
 
     def evolved(self, problem: Round, rng: np.random.Generator) -> Plan:
         """The best schedule found from EDF's."""

@@ -136,18 +136,18 @@ class LeastLatestStart(PlanningScheduler):
             raise InvalidOptionError(f"{self.name}: margin: expected a number >= 0, got {margin}")
         self.margin = margin
 
-    def plan(self, simulator: MurseSimulator, row: int) -> Plan:
+    def plan(self, simulator: MurseSimulator, env_index: int) -> Plan:
         """The rule's schedule of the whole round."""
-        return self.scheduled(simulator, row, estimated_round(simulator, row, self.margin))
+        return self.scheduled(simulator, env_index, estimated_round(simulator, env_index, self.margin))
 
-    def revise(self, simulator: MurseSimulator, row: int, plan: Plan) -> Plan:
+    def revise(self, simulator: MurseSimulator, env_index: int, plan: Plan) -> Plan:
         """The rule's schedule of what is left, where that differs."""
         if simulator.mode == "plan":
             return plan
-        problem = remaining_round(simulator, row, self.margin)
-        return plan if as_expected(problem, plan) else self.scheduled(simulator, row, problem)
+        problem = remaining_round(simulator, env_index, self.margin)
+        return plan if as_expected(problem, plan) else self.scheduled(simulator, env_index, problem)
 
-    def scheduled(self, simulator: MurseSimulator, row: int, problem: Round) -> Plan:
+    def scheduled(self, simulator: MurseSimulator, env_index: int, problem: Round) -> Plan:
         """A plan for what is open in `problem`."""
         return lst_plan(problem)
 
@@ -173,9 +173,9 @@ class LstSearch(LeastLatestStart):
         require_budget(self.name, evaluations, seconds)
         self._budget = evaluations, seconds
 
-    def scheduled(self, simulator: MurseSimulator, row: int, problem: Round) -> Plan:
+    def scheduled(self, simulator: MurseSimulator, env_index: int, problem: Round) -> Plan:
         """The best plan found; its random numbers are those of the row's episode and round."""
         evaluations, seconds = self._budget
         rows = simulator.state.rows
-        key = int(rows["episode"][row]) ^ int(rows["round"][row])
+        key = int(rows["episode"][env_index]) ^ int(rows["round"][env_index])
         return search_plan(problem, evaluations=evaluations, seconds=seconds, objective=simulator.objective, key=key)

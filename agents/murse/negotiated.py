@@ -55,12 +55,12 @@ class NegotiatingScheduler(Scheduler):
         """Messages and bytes."""
         return self.traffic.per_round()
 
-    def start(self, simulator: TurnSimulator, rows: np.ndarray) -> None:
+    def start(self, simulator: TurnSimulator, envs: np.ndarray) -> None:
         """Forget what the rows' agents agreed on."""
-        self.traffic.restart(as_murse(simulator), rows)
+        self.traffic.restart(as_murse(simulator), envs)
         if len(self._rounds) != simulator.batch:
             self._rounds, self._schedules = np.full(simulator.batch, -1), [[] for _ in range(simulator.batch)]
-        self._rounds[rows] = -1
+        self._rounds[envs] = -1
 
     def decide(self, simulator: TurnSimulator) -> np.ndarray:
         """Actions int64 (B,): each acting agent's next task by its own schedule."""
@@ -73,8 +73,8 @@ class NegotiatingScheduler(Scheduler):
             actions[row] = next_own(murse, row, self._schedules[row][int(murse.acting[row])])
         return actions
 
-    def _negotiate(self, simulator: MurseSimulator, row: int) -> None:
-        problem, instance = estimated_round(simulator, row), simulator.instances[row]
+    def _negotiate(self, simulator: MurseSimulator, env_index: int) -> None:
+        problem, instance = estimated_round(simulator, env_index), simulator.instances[env_index]
         deadlines = induced_deadlines(problem)
         schedules = [
             AgentSchedule(agent, problem.durations, problem.lags, problem.near, deadlines)
@@ -84,19 +84,19 @@ class NegotiatingScheduler(Scheduler):
         radius = simulator.view.limits[1] if self._radius is None else self._radius
         hears = hearing(problem.n_agents, instance.map_width, radius)
         talk = negotiate(bidders, hears, _TURNS_PER_TASK * problem.n_tasks)
-        self.traffic.add(simulator, row, talk.messages, talk.bytes)
-        self._schedules[row] = schedules
+        self.traffic.add(simulator, env_index, talk.messages, talk.bytes)
+        self._schedules[env_index] = schedules
 
 
-def next_own(simulator: MurseSimulator, row: int, schedule: AgentSchedule) -> int:
+def next_own(simulator: MurseSimulator, env_index: int, schedule: AgentSchedule) -> int:
     """The action of the next task on an agent's own list, or 0 while it has to wait.
 
     It goes for a task that is taken if it has not heard of that. It waits until what the task waits for and near
     tasks that it believes to come before have been dispatched.
     """
     agent, tasks = schedule.agent, simulator.state.tasks
-    holders = tasks["agent"][row]
-    told = simulator.state.private_memory[row, agent, :, 1] >= 0
+    holders = tasks["agent"][env_index]
+    told = simulator.state.private_memory[env_index, agent, :, 1] >= 0
     for task in schedule.path:
         if holders[task] == agent or told[task]:
             continue
@@ -104,7 +104,7 @@ def next_own(simulator: MurseSimulator, row: int, schedule: AgentSchedule) -> in
             return task + 1
         before = (schedule.starts != UNKNOWN) & (schedule.starts < schedule.starts[task]) & schedule.near[task]
         open_before = before & (holders[: len(before)] == NOBODY)
-        return 0 if open_before.any() or not simulator.dispatchable(row, task, agent) else task + 1
+        return 0 if open_before.any() or not simulator.dispatchable(env_index, task, agent) else task + 1
     return 0
 
 

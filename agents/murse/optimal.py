@@ -51,17 +51,17 @@ class ExactScheduler(PlanningScheduler):
         self.solutions: dict[tuple[int, int], Solution] = {}
         self._measures = {name: np.zeros((0, 0)) for name in SOLVER_MEASURES}
 
-    def start(self, simulator: TurnSimulator, rows: np.ndarray) -> None:
-        """Forget the plans, solutions and measures of `rows`, bool (B,)."""
-        super().start(simulator, rows)
+    def start(self, simulator: TurnSimulator, envs: np.ndarray) -> None:
+        """Forget the plans, solutions and measures of `envs`, bool (B,)."""
+        super().start(simulator, envs)
         self.solutions = {
-            key: found for key, found in self.solutions.items() if key[0] < len(rows) and not rows[key[0]]
+            key: found for key, found in self.solutions.items() if key[0] < len(envs) and not envs[key[0]]
         }
         shape = (simulator.batch, getattr(simulator, "horizon", 1))
         for name, values in self._measures.items():
             if values.shape != shape:
                 self._measures[name] = np.full(shape, np.nan)
-            self._measures[name][rows] = np.nan
+            self._measures[name][envs] = np.nan
 
     def per_round(self) -> dict[str, np.ndarray]:
         """SOLVER_MEASURES, float64 (B, rounds), NaN where no round was solved.
@@ -70,22 +70,22 @@ class ExactScheduler(PlanningScheduler):
         """
         return {name: values.copy() for name, values in self._measures.items()}
 
-    def plan(self, simulator: MurseSimulator, row: int) -> Plan:
+    def plan(self, simulator: MurseSimulator, env_index: int) -> Plan:
         """The solution of the round on estimates, everything as early as its order allows."""
-        problem = self.whole(simulator, row)
-        plan = self._solved(simulator, row, problem)
+        problem = self.whole(simulator, env_index)
+        plan = self._solved(simulator, env_index, problem)
         return timed(problem, plan.tasks, plan.agents)
 
-    def whole(self, simulator: MurseSimulator, row: int) -> Round:
+    def whole(self, simulator: MurseSimulator, env_index: int) -> Round:
         """The round as the solver is given it at its beginning."""
-        return estimated_round(simulator, row)
+        return estimated_round(simulator, env_index)
 
-    def _solved(self, simulator: MurseSimulator, row: int, problem: Round) -> Plan:
+    def _solved(self, simulator: MurseSimulator, env_index: int, problem: Round) -> Plan:
         first = best_rule_plan(problem, simulator.objective)
         solution = solve(problem, objective=simulator.objective, start=first, **self._limits)
-        now = int(simulator.state.rows["round"][row])
-        self.solutions[row, now] = solution
-        instance = simulator.instances[row]
+        now = int(simulator.state.rows["round"][env_index])
+        self.solutions[env_index, now] = solution
+        instance = simulator.instances[env_index]
         certain = instance.durations == "deterministic" or instance.n_humans == 0
         new = {
             "bound": solution.bound if certain else np.nan,  # a bound on estimates proves nothing of what happens
@@ -94,12 +94,12 @@ class ExactScheduler(PlanningScheduler):
             "without_plan": solution.plan is None,
             "solver_seconds": solution.seconds,
         }
-        again = not np.isnan(self._measures["optimal"][row, now])
+        again = not np.isnan(self._measures["optimal"][env_index, now])
         for name, value in new.items():
             if not again:
-                self._measures[name][row, now] = value
+                self._measures[name][env_index, now] = value
             elif name != "bound":
-                self._measures[name][row, now] += value
+                self._measures[name][env_index, now] += value
         return first if solution.plan is None else solution.plan
 
 
@@ -125,16 +125,16 @@ class RollingScheduler(ExactScheduler):
             raise InvalidOptionError(f"{self.name}: margin: expected a number >= 0, got {margin}")
         self._margin = margin
 
-    def whole(self, simulator: MurseSimulator, row: int) -> Round:
+    def whole(self, simulator: MurseSimulator, env_index: int) -> Round:
         """The round with the margin on every duration."""
-        return estimated_round(simulator, row, self._margin)
+        return estimated_round(simulator, env_index, self._margin)
 
-    def revise(self, simulator: MurseSimulator, row: int, plan: Plan) -> Plan:
+    def revise(self, simulator: MurseSimulator, env_index: int, plan: Plan) -> Plan:
         """A plan for what is left of the round."""
         if simulator.mode == "plan":
             return plan
-        problem = remaining_round(simulator, row, self._margin)
-        return plan if as_expected(problem, plan) else self._solved(simulator, row, problem)
+        problem = remaining_round(simulator, env_index, self._margin)
+        return plan if as_expected(problem, plan) else self._solved(simulator, env_index, problem)
 
 
 def is_feasible(instance: MurseInstance, time_limit: float | None = None) -> bool:

@@ -145,9 +145,9 @@ class EdfPublished(PlanningScheduler):
 
     name = "edf-published"
 
-    def plan(self, simulator: MurseSimulator, row: int) -> Plan:
+    def plan(self, simulator: MurseSimulator, env_index: int) -> Plan:
         """The rule's schedule."""
-        return published_schedule(estimated_round(simulator, row))
+        return published_schedule(estimated_round(simulator, env_index))
 
 
 class GeneticPublished(GeneticEdf):

@@ -99,9 +99,9 @@ class FirstClaim(ObservationScheduler):
     def __init__(self) -> None:
         self.traffic = Traffic()
 
-    def start(self, simulator: TurnSimulator, rows: np.ndarray) -> None:
+    def start(self, simulator: TurnSimulator, envs: np.ndarray) -> None:
         """Begin to count anew."""
-        self.traffic.restart(as_murse(simulator), rows)
+        self.traffic.restart(as_murse(simulator), envs)
 
     def choose(self, observation: Observation, uniform: np.ndarray) -> np.ndarray:
         """Actions int64 (B,), ties to the lower index; `uniform` is not used."""

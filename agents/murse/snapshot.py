@@ -22,31 +22,31 @@ def as_murse(simulator: TurnSimulator) -> MurseSimulator:
     return simulator
 
 
-def estimated_round(simulator: MurseSimulator, row: int, margin: float = 0.0) -> Round:
+def estimated_round(simulator: MurseSimulator, env_index: int, margin: float = 0.0) -> Round:
     """The whole of a row's present round on the durations that the team counts on.
 
     `margin` standard deviations of each duration are added to them, rounded to whole units.
     """
-    instance = simulator.instances[row]
-    pairs = simulator.state.pairs[row, : instance.n_tasks, : instance.n_agents]
+    instance = simulator.instances[env_index]
+    pairs = simulator.state.pairs[env_index, : instance.n_tasks, : instance.n_agents]
     planned = pairs["planned"] + np.rint(margin * pairs["spread"]).astype(np.int64)
     return Round.of(instance, np.where(instance.eligible, planned, INELIGIBLE))
 
 
-def remaining_round(simulator: MurseSimulator, row: int, margin: float = 0.0) -> Round:
+def remaining_round(simulator: MurseSimulator, env_index: int, margin: float = 0.0) -> Round:
     """What is left of a row's round: committed tasks with their believed times, agents when they are believed free.
 
     Nobody is free before now. A committed task has no deadline any more: nothing can be done about it. `margin` is
     added to the durations of open tasks, as in `estimated_round`.
     """
-    whole, state = estimated_round(simulator, row, margin), simulator.state
-    n, clock = whole.n_tasks, int(state.rows["clock"][row])
-    agents = state.tasks["agent"][row, :n].copy()
+    whole, state = estimated_round(simulator, env_index, margin), simulator.state
+    n, clock = whole.n_tasks, int(state.rows["clock"][env_index])
+    agents = state.tasks["agent"][env_index, :n].copy()
     taken = np.flatnonzero(agents != NOBODY)
     start, finish = np.zeros((2, simulator.max_actions), np.int64)
     heard = np.ones(simulator.max_agents, np.bool_)
-    viewer = int(simulator.acting[row])
-    believes(state, simulator.rules, row, viewer, heard, state.tasks["agent"][row] != NOBODY, start, finish)
+    viewer = int(simulator.acting[env_index])
+    believes(state, simulator.rules, env_index, viewer, heard, state.tasks["agent"][env_index] != NOBODY, start, finish)
     durations, ready = whole.durations.copy(), np.full(whole.n_agents, clock)
     fixed, deadlines = np.full(n, -1), whole.deadlines.copy()
     durations[taken, agents[taken]] = (finish - start)[taken]

@@ -47,9 +47,9 @@ class Tercio(PlanningScheduler):
             raise InvalidOptionError(f"{self.name}: allocations: expected an integer >= 1, got {allocations}")
         self._allocations = allocations
 
-    def plan(self, simulator: MurseSimulator, row: int) -> Plan:
+    def plan(self, simulator: MurseSimulator, env_index: int) -> Plan:
         """The best schedule found."""
-        return tercio(estimated_round(simulator, row), self._allocations)
+        return tercio(estimated_round(simulator, env_index), self._allocations)
 
 
 def tercio(problem: Round, allocations: int) -> Plan:

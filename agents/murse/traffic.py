@@ -13,18 +13,18 @@ class Traffic:
     def __init__(self) -> None:
         self.messages, self.bytes = np.zeros((0, 0), np.int64), np.zeros((0, 0), np.int64)
 
-    def restart(self, simulator: MurseSimulator, rows: np.ndarray) -> None:
-        """Set the counters of `rows`, bool (B,), to 0."""
+    def restart(self, simulator: MurseSimulator, envs: np.ndarray) -> None:
+        """Set the counters of `envs`, bool (B,), to 0."""
         shape = (simulator.batch, simulator.horizon)
         if self.messages.shape != shape:
             self.messages, self.bytes = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
-        self.messages[rows], self.bytes[rows] = 0, 0
+        self.messages[envs], self.bytes[envs] = 0, 0
 
-    def add(self, simulator: MurseSimulator, row: int, messages: int, size: int) -> None:
+    def add(self, simulator: MurseSimulator, env_index: int, messages: int, size: int) -> None:
         """Count in the round that is being played."""
-        now = int(simulator.state.rows["round"][row])
-        self.messages[row, now] += messages
-        self.bytes[row, now] += size
+        now = int(simulator.state.rows["round"][env_index])
+        self.messages[env_index, now] += messages
+        self.bytes[env_index, now] += size
 
     def per_round(self) -> dict[str, np.ndarray]:
         """`messages` and `bytes`, float64 (B, R)."""

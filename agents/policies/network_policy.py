@@ -90,10 +90,10 @@ class NetworkPolicy(ObservationScheduler):
             check_graph(Path(path).with_suffix(".json"), card, graph)
         return cls(network, name=Path(path).stem, mode=card.mode if mode is None else mode, card=card)
 
-    def start(self, simulator: TurnSimulator, rows: np.ndarray) -> None:
+    def start(self, simulator: TurnSimulator, envs: np.ndarray) -> None:
         """Forget what was seen in earlier episodes of these rows."""
-        if self._first.time.shape == rows.shape:
-            self._first.time[rows] = _NEVER
+        if self._first.time.shape == envs.shape:
+            self._first.time[envs] = _NEVER
 
     def decide(self, simulator: TurnSimulator) -> np.ndarray:
         """Observe for every acting agent under the simulator's view, then choose.
@@ -114,7 +114,7 @@ class NetworkPolicy(ObservationScheduler):
             actions[rows] = self._pick(logits, noise, observation)
         return actions
 
-    def _of_epoch(self, simulator: TurnSimulator, rows: np.ndarray, observation: Observation) -> np.ndarray:
+    def _of_epoch(self, simulator: TurnSimulator, envs: np.ndarray, observation: Observation) -> np.ndarray:
         """The logits of the first turn of each row's decision epoch, for the actions that are still legal."""
         if simulator.view.hides:
             raise InvalidOptionError(
@@ -125,11 +125,11 @@ class NetworkPolicy(ObservationScheduler):
         if self._first.logits.shape != (simulator.batch, legal.shape[1]):
             never = np.full(simulator.batch, _NEVER)
             self._first = _FirstLogits(never, np.zeros((simulator.batch, legal.shape[1]), np.float32))
-        new = self._first.time[rows] != simulator.time[rows]
+        new = self._first.time[envs] != simulator.time[envs]
         if new.any():
-            self._first.logits[rows[new]] = self.logits({name: values[new] for name, values in observation.items()})
-            self._first.time[rows] = simulator.time[rows]
-        return np.where(legal, self._first.logits[rows], np.finfo(np.float32).min)
+            self._first.logits[envs[new]] = self.logits({name: values[new] for name, values in observation.items()})
+            self._first.time[envs] = simulator.time[envs]
+        return np.where(legal, self._first.logits[envs], np.finfo(np.float32).min)
 
     def choose(self, observation: Observation, uniform: np.ndarray) -> np.ndarray:
         """Actions int64 (B,) from batched observations and uniforms float64 (B,) in [0, 1)."""

@@ -29,15 +29,19 @@ _HOUR = 2  # pixels an hour is wide
 _BOARD_COLUMNS = 3
 
 
-def fleet_board(simulator: AirmeSimulator, row: int = 0) -> str:
+def fleet_board(simulator: AirmeSimulator, env_index: int = 0) -> str:
     """The fleet and the crews of one row at this hour, as text."""
-    state, n_planes, n_crews = simulator.state, simulator.state.rows["n_planes"][row], simulator.n_agents[row]
+    state, n_planes, n_crews = (
+        simulator.state,
+        simulator.state.rows["n_planes"][env_index],
+        simulator.n_agents[env_index],
+    )
     means = simulator.objectives()
-    head = f"hour {simulator.time[row]:>4}   " + "   ".join(f"{k} {v[row]:.3f}" for k, v in means.items())
-    cells = [_plane_cell(state.planes[row, slot], slot) for slot in range(1, n_planes + 1)]
+    head = f"hour {simulator.time[env_index]:>4}   " + "   ".join(f"{k} {v[env_index]:.3f}" for k, v in means.items())
+    cells = [_plane_cell(state.planes[env_index, slot], slot) for slot in range(1, n_planes + 1)]
     height = -(-len(cells) // _BOARD_COLUMNS)
     lines = ["   ".join(cells[i::height]) for i in range(height)]
-    crews = [_crew_cell(state.crews[row, crew], crew) for crew in range(n_crews)]
+    crews = [_crew_cell(state.crews[env_index, crew], crew) for crew in range(n_crews)]
     return "\n".join([head, *lines, "   ".join(crews)])
 
 
@@ -57,7 +61,7 @@ def _crew_cell(crew: np.void, index: int) -> str:
     return f"crew {index}: " + (f"plane {crew['plane']}" if crew["plane"] else "free")
 
 
-def timeline(simulator: AirmeSimulator, row: int = 0) -> np.ndarray:
+def timeline(simulator: AirmeSimulator, env_index: int = 0) -> np.ndarray:
     """What every plane did in every hour so far, uint8 (height, width, 3): one band per plane, one column per hour.
 
     Grey is grounded, blue flying, red broken and waiting, amber in repair. Raises InvalidOptionError if the
@@ -65,8 +69,8 @@ def timeline(simulator: AirmeSimulator, row: int = 0) -> np.ndarray:
     """
     if not len(simulator.state.timeline):
         raise InvalidOptionError("render: the simulator was made without record_timeline=True")
-    hours, n_planes = max(int(simulator.time[row]), 1), simulator.state.rows["n_planes"][row]
-    status = simulator.state.timeline[row, :hours, 1 : n_planes + 1].T
+    hours, n_planes = max(int(simulator.time[env_index]), 1), simulator.state.rows["n_planes"][env_index]
+    status = simulator.state.timeline[env_index, :hours, 1 : n_planes + 1].T
     palette = np.array([COLOURS[k] for k in sorted(COLOURS)], np.uint8)
     image = palette[status].repeat(CELL, axis=0).repeat(_HOUR, axis=1)
     image[CELL - 1 :: CELL] = 255

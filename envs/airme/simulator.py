@@ -114,14 +114,14 @@ class AirmeSimulator(TurnSimulator):
 
     def reset(
         self,
-        rows: np.ndarray | None = None,
+        envs: np.ndarray | None = None,
         *,
         seed: int | None = None,
         instances: Sequence[AirmeInstance] | None = None,
         episodes: Sequence[int] | None = None,
     ) -> None:
         """Start new episodes; see TurnSimulator.reset."""
-        chosen = np.arange(self.batch) if rows is None else np.flatnonzero(rows)
+        chosen = np.arange(self.batch) if envs is None else np.flatnonzero(envs)
         for name, given in (("instances", instances), ("episodes", episodes)):
             if given is not None and len(given) != len(chosen):
                 raise InvalidOptionError(f"{name}: expected one per chosen row ({len(chosen)}), got {len(given)}")
@@ -226,20 +226,22 @@ class AirmeSimulator(TurnSimulator):
         graph.observe(self.state, self.rules.usage, np.ascontiguousarray(agents, np.int64), limits, arrays)
         return out
 
-    def free_agents(self, row: int) -> np.ndarray:
+    def free_agents(self, env_index: int) -> np.ndarray:
         """Crews that have still to act in this hour."""
-        n = self.n_agents[row]
-        free = (self.state.crews["plane"][row, :n] == 0) & (self.state.crews["choice"][row, :n] == dynamics.UNDECIDED)
-        return np.flatnonzero(free) if not self.over[row] else np.empty(0, np.int64)
+        n = self.n_agents[env_index]
+        free = (self.state.crews["plane"][env_index, :n] == 0) & (
+            self.state.crews["choice"][env_index, :n] == dynamics.UNDECIDED
+        )
+        return np.flatnonzero(free) if not self.over[env_index] else np.empty(0, np.int64)
 
     def objectives(self) -> dict[str, np.ndarray]:
         """Means over the hours played, float64 (B,): profit, revenue and availability (M1 at the horizon)."""
         hours = np.maximum(self.time, 1)
         return {name: self.state.rows["sums"][:, k] / hours for k, name in enumerate(dynamics.OBJECTIVES)}
 
-    def snapshot(self, row: int) -> dict[str, np.ndarray]:
+    def snapshot(self, env_index: int) -> dict[str, np.ndarray]:
         """Copies of a row's books, planes and crews."""
-        return {name: getattr(self.state, name)[row].copy() for name in ("rows", "planes", "crews")}
+        return {name: getattr(self.state, name)[env_index].copy() for name in ("rows", "planes", "crews")}
 
 
 def fleet_types(instances: Sequence[AirmeInstance]) -> tuple[AircraftType, ...]:

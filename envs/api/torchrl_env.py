@@ -195,14 +195,14 @@ class SchedulingTorchRL(SavesState, EnvBase):
             entries[name] = seen
         return tensordict.update(self._tensordict(entries))
 
-    def _start(self, rows: np.ndarray) -> None:
-        """Begin the next episode of `rows`, bool (B,)."""
-        self._count[rows] += 1
+    def _start(self, envs: np.ndarray) -> None:
+        """Begin the next episode of `envs`, bool (B,)."""
+        self._count[envs] += 1
         self.simulator.reset(
-            rows,
+            envs,
             seed=self._seed,
-            instances=self._instances(np.flatnonzero(rows), self._count[rows]),
-            episodes=[episode_number(int(n), self.split) for n in (self._first + self._count * self._stride)[rows]],
+            instances=self._instances(np.flatnonzero(envs), self._count[envs]),
+            episodes=[episode_number(int(n), self.split) for n in (self._first + self._count * self._stride)[envs]],
         )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:

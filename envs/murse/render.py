@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 ROBOT, HUMAN, LATE, WAIT = "#56a0d3", "#f4b040", "#cb4335", "#7f8c8d"
 
 
-def board(simulator: MurseSimulator, row: int = 0) -> str:
+def board(simulator: MurseSimulator, env_index: int = 0) -> str:
     """Agents with their commitments of this round, as text; in `plan` mode the times are planned ones."""
-    state, instance = simulator.state, simulator.instances[row]
-    record, tasks = state.rows[row], state.tasks[row]
-    results = "   ".join(f"{name} {values[row]:.2f}" for name, values in simulator.objectives().items())
+    state, instance = simulator.state, simulator.instances[env_index]
+    record, tasks = state.rows[env_index], state.tasks[env_index]
+    results = "   ".join(f"{name} {values[env_index]:.2f}" for name, values in simulator.objectives().items())
     lines = [f"round {record['round']}   clock {record['clock']:>5}   {results}"]
     for agent in range(instance.n_agents):
-        own = [i for i in state.order[row, : record["dispatched"]] if tasks["agent"][i] == agent]
+        own = [i for i in state.order[env_index, : record["dispatched"]] if tasks["agent"][i] == agent]
         jobs = "  ".join(f"{i + 1}[{tasks['start'][i]},{tasks['finish'][i]})" for i in own)
         mark = "*" if record["acting"] == agent else " "
         lines.append(f"{mark}{'robot' if agent < instance.n_robots else 'human'} {agent}: {jobs or '-'}")
@@ -36,14 +36,14 @@ def board(simulator: MurseSimulator, row: int = 0) -> str:
     return "\n".join(lines)
 
 
-def gantt(simulator: MurseSimulator, row: int = 0) -> np.ndarray:
+def gantt(simulator: MurseSimulator, env_index: int = 0) -> np.ndarray:
     """The Gantt chart of the last ended round as an image, uint8 (height, width, 3).
 
     Before a round has ended it shows the map. Raises ModuleNotFoundError without matplotlib.
     """
-    if simulator.state.rows["round"][row] == 0:
-        return _image(map_figure(simulator, row))
-    return _image(gantt_figure(schedule(simulator, row)))
+    if simulator.state.rows["round"][env_index] == 0:
+        return _image(map_figure(simulator, env_index))
+    return _image(gantt_figure(schedule(simulator, env_index)))
 
 
 def gantt_figure(data: dict[str, Any]) -> Figure:
@@ -84,11 +84,11 @@ def _is_late(data: dict[str, Any], job: dict[str, Any]) -> bool:
     return deadline is not None and job["finish"] > deadline
 
 
-def map_figure(simulator: MurseSimulator, row: int = 0) -> Figure:
+def map_figure(simulator: MurseSimulator, env_index: int = 0) -> Figure:
     """Where the tasks are and where the agents stand; tasks nearer than the safety distance are joined."""
-    state, instance = simulator.state, simulator.instances[row]
+    state, instance = simulator.state, simulator.instances[env_index]
     figure, axes = _figure(5.0, 5.0)
-    taken = state.tasks["agent"][row, : instance.n_tasks] != NOBODY
+    taken = state.tasks["agent"][env_index, : instance.n_tasks] != NOBODY
     for i, j in np.argwhere(np.triu(instance.near)):
         axes.plot(*instance.locations[[i, j]].T, color=WAIT, linewidth=0.5, zorder=1)
     x, y = instance.locations.T
@@ -98,7 +98,7 @@ def map_figure(simulator: MurseSimulator, row: int = 0) -> Figure:
         places.setdefault((float(a), float(b)), []).append(str(i + 1))
     for (a, b), names in places.items():
         axes.text(a, b, ",".join(names), ha="center", va="center", fontsize=7, zorder=3)
-    for agent, last in enumerate(state.agents["last_task"][row, : instance.n_agents]):
+    for agent, last in enumerate(state.agents["last_task"][env_index, : instance.n_agents]):
         stand = instance.locations[last] if last >= 0 else np.zeros(2)
         colour = ROBOT if agent < instance.n_robots else HUMAN
         axes.scatter(stand[0] + 0.12 * (agent + 1), stand[1] - 0.2, s=40, c=colour, marker="s", zorder=4)

@@ -18,19 +18,19 @@ if TYPE_CHECKING:
 SCHEMA = 1
 
 
-def schedule(simulator: MurseSimulator, row: int = 0, round_index: int | None = None) -> dict[str, Any]:
+def schedule(simulator: MurseSimulator, env_index: int = 0, round_index: int | None = None) -> dict[str, Any]:
     """An ended round of one row, the last one by default, with the constraints that it has to keep.
 
     `dispatch` lists the tasks, counted from 1, in order of dispatch with agent, true duration and true times; in
     `online` mode also the time at which the agent committed, before which the task cannot start. Raises
     InvalidOptionError if the round has not ended.
     """
-    ended = int(simulator.state.rows["round"][row])
+    ended = int(simulator.state.rows["round"][env_index])
     chosen = ended - 1 if round_index is None else round_index
     if not 0 <= chosen < ended:
-        raise InvalidOptionError(f"round {chosen}: {ended} rounds have ended in row {row}")
-    instance, result = simulator.instances[row], simulator.state.rounds[row, chosen]
-    executed = simulator.state.executed[row, chosen, : instance.n_tasks]
+        raise InvalidOptionError(f"round {chosen}: {ended} rounds have ended in row {env_index}")
+    instance, result = simulator.instances[env_index], simulator.state.rounds[env_index, chosen]
+    executed = simulator.state.executed[env_index, chosen, : instance.n_tasks]
     dispatched = [i for i in np.argsort(executed["position"], kind="stable") if executed["agent"][i] != NOBODY]
     ahead = instance.waits_by_task()
     names = ("agent", "start", "finish", *(("committed",) if simulator.mode == "online" else ()))
@@ -65,15 +65,17 @@ def schedule(simulator: MurseSimulator, row: int = 0, round_index: int | None = 
     }
 
 
-def save_schedule(simulator: MurseSimulator, path: str | Path, row: int = 0, round_index: int | None = None) -> None:
+def save_schedule(
+    simulator: MurseSimulator, path: str | Path, env_index: int = 0, round_index: int | None = None
+) -> None:
     """Write `schedule` as JSON, beside and renamed."""
-    write_json(path, schedule(simulator, row, round_index))
+    write_json(path, schedule(simulator, env_index, round_index))
 
 
-def save_schedules(simulator: MurseSimulator, row: int, path: Path) -> list[Path]:
+def save_schedules(simulator: MurseSimulator, env_index: int, path: Path) -> list[Path]:
     """Write every ended round of a row to `path` with the round's number and .json behind it; the files written."""
     paths = []
-    for k in range(int(simulator.state.rows["round"][row])):
+    for k in range(int(simulator.state.rows["round"][env_index])):
         paths.append(path.with_name(f"{path.name}-round{k}.json"))
-        save_schedule(simulator, paths[-1], row, k)
+        save_schedule(simulator, paths[-1], env_index, k)
     return paths

@@ -126,14 +126,14 @@ class MurseSimulator(TurnSimulator):
 
     def reset(
         self,
-        rows: np.ndarray | None = None,
+        envs: np.ndarray | None = None,
         *,
         seed: int | None = None,
         instances: Sequence[MurseInstance] | None = None,
         episodes: Sequence[int] | None = None,
     ) -> None:
         """Start new episodes; see TurnSimulator.reset."""
-        chosen = np.arange(self.batch) if rows is None else np.flatnonzero(rows)
+        chosen = np.arange(self.batch) if envs is None else np.flatnonzero(envs)
         for name, given in (("instances", instances), ("episodes", episodes)):
             if given is not None and len(given) != len(chosen):
                 raise InvalidOptionError(f"{name}: expected one per chosen row ({len(chosen)}), got {len(given)}")
@@ -174,28 +174,28 @@ class MurseSimulator(TurnSimulator):
             raise IllegalActionError(f"target {bad}: expected a task's slot in [0, {self.max_actions - 1}]")
         dynamics.step(self.state, self.rules, actions)
 
-    def play_round(self, row: int, tasks: np.ndarray, agents: np.ndarray) -> None:
+    def play_round(self, env_index: int, tasks: np.ndarray, agents: np.ndarray) -> None:
         """Execute a whole schedule as this round's plan in one row, whatever was dispatched so far.
 
         tasks and agents int64 (K,) are the pairs in order of dispatch, counted from 0, each task at most once and
         each pair eligible; K below the number of tasks leaves the round stuck. Only in `plan` mode. Raises
         IllegalActionError for anything else.
         """
-        instance, tasks, agents = self.instances[row], np.asarray(tasks, np.int64), np.asarray(agents, np.int64)
+        instance, tasks, agents = self.instances[env_index], np.asarray(tasks, np.int64), np.asarray(agents, np.int64)
         if self.mode != "plan":
             raise IllegalActionError("play_round: a whole schedule can only be given in plan mode")
-        if self.acting[row] == NOBODY:
+        if self.acting[env_index] == NOBODY:
             raise IllegalActionError("play_round: the episode is over, call reset()")
         inside = (tasks >= 0) & (tasks < instance.n_tasks) & (agents >= 0) & (agents < instance.n_agents)
         if not inside.all() or not instance.eligible[tasks, agents].all():
             raise IllegalActionError("play_round: expected eligible pairs of a task and an agent of this instance")
         if len(np.unique(tasks)) != len(tasks):
             raise IllegalActionError("play_round: a task is dispatched twice")
-        dynamics.play_round(self.state, self.rules, row, tasks, agents)
+        dynamics.play_round(self.state, self.rules, env_index, tasks, agents)
 
-    def dispatchable(self, row: int, task: int, agent: int) -> bool:
+    def dispatchable(self, env_index: int, task: int, agent: int) -> bool:
         """Whether an agent could in truth commit to a task, counted from 0, at this decision epoch."""
-        return bool(dynamics.dispatchable(self.state, row, task, agent))
+        return bool(dynamics.dispatchable(self.state, env_index, task, agent))
 
     def observe(self, agents: np.ndarray, out: Observation | None = None) -> Observation:
         """The graph each row's agent sees under the simulator's view; see TurnSimulator.observe."""
@@ -212,13 +212,13 @@ class MurseSimulator(TurnSimulator):
         observation.observe(self.state, self.rules, np.asarray(agents, np.int64), *limits, arrays)
         return out
 
-    def free_agents(self, row: int) -> np.ndarray:
+    def free_agents(self, env_index: int) -> np.ndarray:
         """Agents that have still to act at this decision epoch, in turn order as things stand."""
-        if self.over[row]:
+        if self.over[env_index]:
             return np.empty(0, np.int64)
-        free_at = self.state.agents["free_at"][row, : self.n_agents[row]]
-        free = np.flatnonzero(free_at <= self.state.rows["clock"][row])
-        keys = [dynamics.preference(self.state, self.rules.picking, row, int(agent)) for agent in free]
+        free_at = self.state.agents["free_at"][env_index, : self.n_agents[env_index]]
+        free = np.flatnonzero(free_at <= self.state.rows["clock"][env_index])
+        keys = [dynamics.preference(self.state, self.rules.picking, env_index, int(agent)) for agent in free]
         return free[np.argsort(keys, kind="stable")]
 
     @property
@@ -259,14 +259,14 @@ class MurseSimulator(TurnSimulator):
         }
         return {name: np.where(ended, values, np.nan) for name, values in measures.items()}
 
-    def round_results(self, row: int) -> np.ndarray:
+    def round_results(self, env_index: int) -> np.ndarray:
         """A copy of the ended rounds' results, state.ROUND (n,)."""
-        return self.state.rounds[row, : self.state.rows["round"][row]].copy()
+        return self.state.rounds[env_index, : self.state.rows["round"][env_index]].copy()
 
-    def snapshot(self, row: int) -> dict[str, np.ndarray]:
+    def snapshot(self, env_index: int) -> dict[str, np.ndarray]:
         """Copies of a row's state, without its instance's constants."""
         names = ("rows", "tasks", "agents", "pairs", "filters", "order", "private_memory", "rounds", "executed")
-        return {name: getattr(self.state, name)[row].copy() for name in names}
+        return {name: getattr(self.state, name)[env_index].copy() for name in names}
 
 
 def _code(what: str, name: str, known: tuple[str, ...]) -> int:

@@ -70,7 +70,7 @@ class IndexScheduler(AdvantageScheduler):
         self._problem = (objective, horizon, tuple(types), failure)
         self._ranking: Ranking | None = None
 
-    def start(self, simulator: TurnSimulator, rows: np.ndarray) -> None:
+    def start(self, simulator: TurnSimulator, envs: np.ndarray) -> None:
         """Plan for the simulator's objective, horizon, types and failure model."""
         of = cast(AirmeSimulator, simulator)
         problem = (of.objective, of.horizon, of.types, of.failure)

@@ -15,7 +15,7 @@ class Strain:
 
     parts = ("waiting", "travel")
 
-    def start(self, simulator: CouriersSimulator, rows: np.ndarray) -> None:
+    def start(self, simulator: CouriersSimulator, envs: np.ndarray) -> None:
         """Nothing is kept."""
 
     def total(self, simulator: CouriersSimulator) -> np.ndarray:

@@ -14,16 +14,16 @@ BAND = 8  # pixels a courier is high
 _DAY = 10  # pixels a day is wide
 
 
-def board(simulator: CouriersSimulator, row: int = 0) -> str:
+def board(simulator: CouriersSimulator, env_index: int = 0) -> str:
     """The jobs of today, by their slot."""
-    waiting = np.flatnonzero(simulator.jobs["there"][row] & ~simulator.jobs["taken"][row])
-    return f"day {simulator.time[row]}   waiting: {', '.join(map(str, waiting)) or 'none'}"
+    waiting = np.flatnonzero(simulator.jobs["there"][env_index] & ~simulator.jobs["taken"][env_index])
+    return f"day {simulator.time[env_index]}   waiting: {', '.join(map(str, waiting)) or 'none'}"
 
 
-def timeline(simulator: CouriersSimulator, row: int = 0) -> np.ndarray:
+def timeline(simulator: CouriersSimulator, env_index: int = 0) -> np.ndarray:
     """What every courier did on every day so far, uint8 (height, width, 3)."""
-    days = max(int(simulator.time[row]), 1)
-    image = np.full((int(simulator.n_agents[row]), days, 3), IDLE, np.uint8)
-    for courier, day, length in simulator.history[row]:
+    days = max(int(simulator.time[env_index]), 1)
+    image = np.full((int(simulator.n_agents[env_index]), days, 3), IDLE, np.uint8)
+    for courier, day, length in simulator.history[env_index]:
         image[courier, day : day + length] = BUSY
     return image.repeat(BAND, axis=0).repeat(_DAY, axis=1)

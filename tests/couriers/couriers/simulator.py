@@ -70,14 +70,14 @@ class CouriersSimulator(TurnSimulator):
 
     def reset(
         self,
-        rows: np.ndarray | None = None,
+        envs: np.ndarray | None = None,
         *,
         seed: int | None = None,
         instances: Sequence[Any] | None = None,
         episodes: Sequence[int] | None = None,
     ) -> None:
         """Start new episodes; see TurnSimulator.reset."""
-        chosen = np.arange(self.batch) if rows is None else np.flatnonzero(rows)
+        chosen = np.arange(self.batch) if envs is None else np.flatnonzero(envs)
         for name, given in (("instances", instances), ("episodes", episodes)):
             if given is not None and len(given) != len(chosen):
                 raise InvalidOptionError(f"{name}: expected one per chosen env ({len(chosen)}), got {len(given)}")
@@ -125,11 +125,11 @@ class CouriersSimulator(TurnSimulator):
             mine["available"], mine["free"] = not away, self.until[b, c] <= day
             mine["acted"], mine["choice"] = False, 0
 
-    def free_agents(self, row: int) -> np.ndarray:
+    def free_agents(self, env_index: int) -> np.ndarray:
         """Couriers that have still to choose today, ascending."""
-        couriers = self.couriers[row]
+        couriers = self.couriers[env_index]
         able = couriers["there"] & couriers["available"] & couriers["free"] & ~couriers["acted"]
-        return np.flatnonzero(able) if not self.over[row] else np.empty(0, np.int64)
+        return np.flatnonzero(able) if not self.over[env_index] else np.empty(0, np.int64)
 
     def step(self, actions: np.ndarray) -> None:
         """Take one turn in every env; see TurnSimulator.step."""
@@ -210,10 +210,10 @@ class CouriersSimulator(TurnSimulator):
         """Means per day played, float64 (B,): jobs that wait, places travelled."""
         return {name: self.sums[:, k] / np.maximum(self.time, 1) for k, name in enumerate(OBJECTIVES)}
 
-    def snapshot(self, row: int) -> dict[str, np.ndarray]:
+    def snapshot(self, env_index: int) -> dict[str, np.ndarray]:
         """Copies of an env's state."""
         names = ("jobs", "couriers", "end", "until", "sums", *_PER_ENV)
-        return {name: np.array(getattr(self, name)[row]) for name in names}
+        return {name: np.array(getattr(self, name)[env_index]) for name in names}
 
 
 _PER_ENV = {
