@@ -12,6 +12,7 @@ import cloudpickle
 import gymnasium
 import numpy as np
 import pytest
+import torch
 
 from marl_sched import airme_v0, murse_v0
 from marl_sched.domain import get_domain
@@ -111,8 +112,9 @@ def play_gymnasium(env, steps):
 def play_torchrl(env, steps):
     out = []
     td = env.current()
-    for _ in range(steps):
-        data, td = env.step_and_maybe_reset(env.rand_action(td))
+    for turn in range(steps):
+        actions = [legal(mask.numpy(), turn) for mask in td["action_mask"]]  # random ones follow torch's own generator
+        data, td = env.step_and_maybe_reset(td.set("action", torch.tensor(actions)))
         out.append({name: value.numpy().tobytes() for name, value in data.flatten_keys(".").items()})
     return out
 
@@ -259,7 +261,7 @@ for name, views, horizon in (("airme", ("full", "local", "random"), 30), ("murse
                 simulator = copy.deepcopy(simulator) if turn % 25 == 7 else simulator
                 masks = simulator.legal()
                 picks = [np.flatnonzero(mask)[(7 * turn + 3) % mask.sum()] for mask in masks]
-                picks[0] = picks[0] if turn % 11 else simulator.max_targets - 1
+                picks[0] = picks[0] if turn % 11 else simulator.max_actions - 1
                 simulator.step(np.array(picks))
                 simulator.observe_all()
                 if simulator.over.any():

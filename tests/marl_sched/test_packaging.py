@@ -52,10 +52,10 @@ def test_core_needs_neither_torch_nor_zenoh():
 
 def test_every_data_file_matches_a_pattern_that_ships_it():
     shipped = {Path(pattern).suffix for pattern in PYPROJECT["tool"]["setuptools"]["package-data"]["*"]}
-    made_by_running = {".pyc", ".nbi", ".nbc"}
+    not_for_users = {".py", ".md"} | {".pyc", ".nbi", ".nbc"}  # pages for readers of the source; made by running
     for folder in FOLDERS:
         for path in (ROOT / folder).rglob("*"):
-            if path.is_file() and path.suffix not in {".py"} | made_by_running:
+            if path.is_file() and path.suffix not in not_for_users:
                 assert path.suffix in shipped, f"{path.relative_to(ROOT)} would be left out of the wheel"
 
 
