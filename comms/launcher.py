@@ -30,7 +30,7 @@ from marl_sched.comms.process import SIGNALS
 from marl_sched.comms.protocol.events import Ending, ExitCode
 from marl_sched.comms.transport.endpoints import settle_port
 from marl_sched.domain import Domain
-from marl_sched.errors import DeploymentError, InvalidFileError, InvalidOptionError, UnknownNameError
+from marl_sched.errors import DeploymentError
 from marl_sched.files import read_json, write_json
 
 WORLD = "world"
@@ -284,25 +284,28 @@ def _world_died(code: int) -> bool:
 def deploy(options: DeployOptions, progress: Progress | None = None) -> dict[str, Any]:
     """Play one run with every agent as a process of its own; the report, with the seconds it took in all.
 
-    It is also written to `options.world.report` if that is set, whatever the end. Raises UnknownNameError,
-    InvalidOptionError and InvalidFileError for what cannot be deployed, DeploymentError naming the process that
-    failed. SIGINT, SIGTERM and SIGHUP end all processes and then this one, with 128 + n.
+    It is also written to `options.world.report` if that is set, whatever the end, but not if the start was refused.
+    Raises UnknownNameError, InvalidOptionError and InvalidFileError for what cannot be deployed, DeploymentError if the
+    endpoint is in use, or naming the process that failed. SIGINT, SIGTERM and SIGHUP end all processes and then this
+    one, with 128 + n.
     """
-    import marl_sched.comms.transport.zenoh_session  # noqa: F401  (what is not installed is missed here, not in a child)
-
     started = time.monotonic()
+    deployment: Deployment | None = None
     report: dict[str, Any] | None = None
     try:
-        with _signals() as stopped, Deployment(options) as deployment:
-            stopped.waiting = True
-            report = deployment.wait(progress, lambda: stopped.number)
+        with _signals() as stopped:
+            import marl_sched.comms.transport.zenoh_session  # noqa: F401  (not installed: missed here, not in a child)
+
+            deployment = Deployment(options)
+            with deployment:
+                stopped.waiting = True
+                report = deployment.wait(progress, lambda: stopped.number)
     except SystemExit as end:
         report = _no_report(options, Ending.INTERRUPTED, f"signal {int(end.code or 0) - 128}", int(end.code or 0))
         raise
-    except (InvalidOptionError, InvalidFileError, UnknownNameError):
-        raise  # nothing was started
     except Exception as error:
-        report = _no_report(options, Ending.FAILED, str(error), int(ExitCode.USER_ERROR))
+        if deployment is not None:  # else it was refused, and nothing was started
+            report = _no_report(options, Ending.FAILED, str(error), int(ExitCode.USER_ERROR))
         raise
     finally:
         if report is not None:

@@ -117,5 +117,9 @@ def _end_with(pipe: int) -> None:
 
 
 def print_progress(phase: str, tick: int, horizon: int) -> None:
-    """One JSON line on stdout."""
-    print(json.dumps({"phase": phase, "tick": tick, "horizon": horizon}), flush=True)
+    """One JSON line on stdout, in a single write: the fork server's lines go to the same pipe and must not split it.
+
+    (`print` writes a line and its end one after the other if Python is not to buffer, as with PYTHONUNBUFFERED.)
+    """
+    sys.stdout.write(json.dumps({"phase": phase, "tick": tick, "horizon": horizon}) + "\n")
+    sys.stdout.flush()

@@ -125,7 +125,11 @@ def test_bytes_that_are_no_text_are_refused(run, fleet):
 
 
 def test_a_folder_without_instances_is_refused(run, tmp_path):
-    refused(run("evaluate", "--schedulers", "condition", "--instances", tmp_path), tmp_path, "*.json")
+    refused(
+        run("evaluate", "--schedulers", "condition", "--instances", tmp_path),
+        tmp_path,
+        "expected at least one instance file",
+    )
 
 
 def test_a_checkpoint_that_is_not_there_is_refused(run, tmp_path):

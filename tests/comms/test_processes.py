@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -17,6 +19,7 @@ import pytest
 
 from marl_sched.comms.launcher import Deployment, deploy
 from marl_sched.comms.options import DeployOptions, WorldOptions
+from marl_sched.comms.process import SIGNALS, print_progress
 from marl_sched.errors import DeploymentError, UnknownNameError
 
 LOCAL = {"view": "local", "view_options": {"reach": 1, "comm": 1, "staleness": 12}}
@@ -52,6 +55,12 @@ def wait_until(condition, seconds: float = 240.0) -> None:
     while not condition():
         assert time.monotonic() < end, f"still not so after {seconds:g} s"
         time.sleep(0.05)
+
+
+def catches(pid: int, numbers: tuple[signal.Signals, ...]) -> bool:
+    """Whether a process has a handler for each of these signals."""
+    (mask,) = re.findall(r"^SigCgt:\s*([0-9a-f]+)$", Path(f"/proc/{pid}/status").read_text(), re.MULTILINE)
+    return all(int(mask, 16) >> (number - 1) & 1 for number in numbers)
 
 
 def run_module(name: str, options: dict, timeout: float = 120.0) -> subprocess.CompletedProcess[str]:
@@ -110,6 +119,21 @@ def test_killed_agent_is_started_again_and_nothing_is_lost(in_process, tmp_path)
     assert (tmp_path / "kept" / "crew_3.log").exists()
     assert (tmp_path / "kept" / "run.jsonl").exists()
     assert processes_of(given.run) == []
+
+
+def test_a_line_of_progress_is_one_write_also_where_python_does_not_buffer(monkeypatch):
+    class Pipe(io.RawIOBase):
+        def writable(self):
+            return True
+
+        def write(self, data):
+            written.append(bytes(data))
+            return len(data)
+
+    written = []
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(Pipe(), write_through=True))
+    print_progress("running", 3, 48)
+    assert [data for data in written if data] == [b'{"phase": "running", "tick": 3, "horizon": 48}\n']
 
 
 @pytest.mark.slow
@@ -180,7 +204,7 @@ def test_frozen_agent_is_given_up_and_comes_back_as_another_incarnation():
 @pytest.mark.slow
 @needs_proc
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
-@pytest.mark.parametrize("at", ["start", "running"])
+@pytest.mark.parametrize("at", ["begun", "running"])
 def test_launcher_that_is_ended_leaves_a_report_and_no_process_or_folder(tmp_path, number, at):
     given = world(horizon=10**6)
     code = (
@@ -201,9 +225,10 @@ def test_launcher_that_is_ended_leaves_a_report_and_no_process_or_folder(tmp_pat
     )  # fmt: skip
     try:
         line = ""
-        while line != ("begun\n" if at == "start" else "running\n"):
+        while line != f"{at}\n":
             line = launcher.stdout.readline()
             assert line, launcher.stderr.read()
+        wait_until(lambda: catches(launcher.pid, SIGNALS))  # they are its first act; a signal before them is Python's
         launcher.send_signal(number)
         _, errors = launcher.communicate(timeout=120)
         wait_until(lambda: processes_of(given.run) == [], 60)
