@@ -24,6 +24,7 @@ from marl_sched.plugins import DOMAINS, import_object, load_offered, offered
 if TYPE_CHECKING:
     from gymnasium.spaces import Space
 
+    from marl_sched.graph import GraphSpec
     from marl_sched.simulation import TurnSimulator
 
 
@@ -167,8 +168,8 @@ class Domain:
             independent check; None: the domain has no such files.
         impossibilities: instance -> why no schedule of it can be feasible, a sentence each; empty if none is known.
         demo: what `marl-sched demo` shows; None: nothing.
-        pressing: observation -> the legal actions, bool (B, n_actions), one of which a greedy policy takes before it
-            does nothing; None: there are none such.
+        pressing: (metagraph, observation of it) -> the legal actions, bool (B, n_actions), one of which a greedy policy
+            takes before it does nothing; None: there are none such.
         legend: what the colours of the `rgb_array` picture mean, meaning -> RGB in 0 .. 255; None: it needs none.
         band: what a band of the `rgb_array` picture is and how many pixels high, such as ("plane", 4); None: the
             picture brings axes of its own.
@@ -202,7 +203,7 @@ class Domain:
     instance_files: Callable[[Path], list[Path]] = _json_files
     save_schedules: Callable[[Any, int, Path], list[Path]] | None = None
     demo: Demo | None = None
-    pressing: Callable[[Mapping[str, np.ndarray]], np.ndarray] | None = None
+    pressing: Callable[[GraphSpec, Mapping[str, np.ndarray]], np.ndarray] | None = None
     legend: Mapping[str, Sequence[int]] | None = None
     band: tuple[str, int] | None = None
 

@@ -107,7 +107,7 @@ def policy_milliseconds(domain: Domain, scale: str, repeats: int) -> float:
     simulator: TurnSimulator = domain.simulator(domain.instances(scale, 1, 0), pad=scale)
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        policy = NetworkPolicy(HetGATNetwork(simulator.graph))
+        policy = NetworkPolicy(HetGATNetwork(simulator.graph), domain=domain.name)
 
     def play() -> None:
         for _ in range(_POLICY_DECISIONS):

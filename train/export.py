@@ -90,7 +90,7 @@ def export_policy(
             horizon=length,
             options=options,
         )
-        policy = NetworkPolicy(network, mode=card.mode)
+        policy = NetworkPolicy(network, mode=card.mode, card=card)
         scores = evaluate_scheduler(problem, policy)
         means = scores.measures[card.objective].mean(axis=1)
         measured[scale] = {

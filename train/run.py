@@ -39,19 +39,24 @@ def train(
     for the command on the policy's card. Raises InvalidOptionError for a directory that holds a run already.
     """
     directory = Path(config.directory())
+    _require_no_run(directory)
+    record = RunRecord(config=config, overrides=list(overrides), revision=source_revision())
+    parts, counters = build(record), Counters()  # before the folder, so that what cannot be trained leaves none
+    if config.start_from is not None:
+        parts = replace(parts, record=structs.replace(record, start=parts.start_from(config.start_from)))
     with exclusive(directory):
-        if (directory / CONFIG).exists():
-            raise InvalidOptionError(
-                f"run_dir: {directory} holds a run already: go on with it by `marl-sched resume {directory}`, or "
-                "choose another folder with run_dir=DIR"
-            )
-        record = RunRecord(config=config, overrides=list(overrides), revision=source_revision())
-        parts, counters = build(record), Counters()
-        if config.start_from is not None:
-            parts = replace(parts, record=structs.replace(record, start=parts.start_from(config.start_from)))
+        _require_no_run(directory)  # another process may have begun one by now
         parts.save(counters, directory)  # first, so that whatever holds a run can be resumed
         write_json(directory / CONFIG, msgspec.to_builtins(parts.record))
         return _loop(parts, counters, directory, callbacks, quiet=quiet)
+
+
+def _require_no_run(directory: Path) -> None:
+    if (directory / CONFIG).exists():
+        raise InvalidOptionError(
+            f"run_dir: {directory} holds a run already: go on with it by `marl-sched resume {directory}`, or "
+            "choose another folder with run_dir=DIR"
+        )
 
 
 def train_from_overrides(overrides: Sequence[str], *, quiet: bool = False) -> Path:

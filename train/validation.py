@@ -37,6 +37,6 @@ class Validation:
 
     def __call__(self, network: PolicyNetwork) -> float:
         """M1, the mean over instances and episodes."""
-        policy = NetworkPolicy(network, mode=self._mode)
+        policy = NetworkPolicy(network, mode=self._mode, domain=self._domain.name)
         scores = evaluate_scheduler(self._problem, policy)
         return float(scores.measures[self._problem.objective].mean())

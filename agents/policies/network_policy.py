@@ -44,21 +44,29 @@ class NetworkPolicy(ObservationScheduler):
         network: on any device; the copy is on the CPU.
         name: as users type it.
         mode: `greedy` takes the most probable action, ties to the lowest index, and never does nothing while an
-            action is pressing (see Domain.pressing; its domain is the card's); `sample` picks by inverse
+            action is pressing (see Domain.pressing); `sample` picks by inverse
             distribution with the uniform that it is given. `one_pass` samples for all agents of a decision epoch from
             what the first of them saw, without the actions that are taken by then: how the dissertation plays what was
             trained with one decision an hour (scheme Single, section 6.3.1). On a lone observation it samples.
         card: what the weights are, if they come from a file.
+        domain: the domain's name, whose pressing actions count; None: the card's. Without either none is pressing.
     """
 
     def __init__(
-        self, network: PolicyNetwork, *, name: str = "unsaved", mode: Mode = "greedy", card: PolicyCard | None = None
+        self,
+        network: PolicyNetwork,
+        *,
+        name: str = "unsaved",
+        mode: Mode = "greedy",
+        card: PolicyCard | None = None,
+        domain: str | None = None,
     ) -> None:
         if mode not in get_args(Mode):
             raise InvalidOptionError(
                 f"mode of policy {name}: expected one of {', '.join(get_args(Mode))}, got {mode!r}"
             )
         self.name, self.mode, self.card = name, mode, card
+        self._domain = card.domain if domain is None and card is not None else domain
         self.samples = mode != "greedy"
         self.graph: GraphSpec = network.spec
         self._network = copy.deepcopy(network).cpu().requires_grad_(False)
@@ -72,11 +80,11 @@ class NetworkPolicy(ObservationScheduler):
         self._first = _FirstLogits(np.zeros(0, np.int64), np.zeros((0, 0), np.float32))
 
     @cached_property
-    def _pressing(self) -> Callable[[Observation], np.ndarray] | None:
-        """What its domain says must not wait; None for a network without a card or of a domain that is not there."""
-        if self.card is None or self.card.domain not in domain_names():
+    def _pressing(self) -> Callable[[GraphSpec, Observation], np.ndarray] | None:
+        """What its domain says must not wait; None without a domain or for one that is not there."""
+        if self._domain is None or self._domain not in domain_names():
             return None
-        return get_domain(self.card.domain).pressing
+        return get_domain(self._domain).pressing
 
     @classmethod
     def load(cls, path: str | Path, *, mode: Mode | None = None, graph: GraphSpec | None = None) -> NetworkPolicy:
@@ -141,7 +149,7 @@ class NetworkPolicy(ObservationScheduler):
         actions = logits.argmax(1)
         if self._pressing is None or actions.all():
             return actions
-        urgent = np.where(self._pressing(observation), logits, -np.inf)
+        urgent = np.where(self._pressing(self.graph, observation), logits, -np.inf)
         return np.where((actions == 0) & (urgent.max(1) > -np.inf), urgent.argmax(1), actions)
 
     @torch.inference_mode()

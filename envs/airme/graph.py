@@ -75,14 +75,21 @@ def graph_spec(n_types: int) -> GraphSpec:
     )
 
 
-def pressing(observation: Mapping[str, np.ndarray]) -> np.ndarray:
+def pressing(spec: GraphSpec, observation: Mapping[str, np.ndarray]) -> np.ndarray:
     """Broken planes that a crew sees as they are and that nobody has in hand, bool (B, P + 1).
+
+    `spec` is the metagraph that the observation is of; without the features `broken` and `age_hours` of planes nothing
+    tells which planes these are, so none is pressing.
 
     Every plane has a home crew, which sees it as it is. If a crew does not idle while it could serve one of these, no
     plane stays broken for ever beside a crew with nothing to do.
     """
+    legal, broken, age = observation["action_mask"] > 0, _PLANE[BROKEN], _PLANE[AGE]
+    names = next((node.features for node in spec.nodes if node.name == "plane"), ())
+    if broken not in names or age not in names:
+        return np.zeros_like(legal)
     plane = observation["plane"]
-    return (plane[..., BROKEN] > 0) & (plane[..., AGE] == 0) & (observation["action_mask"] > 0)
+    return (plane[..., names.index(broken)] > 0) & (plane[..., names.index(age)] == 0) & legal
 
 
 class Arrays(NamedTuple):

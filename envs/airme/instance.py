@@ -26,7 +26,8 @@ MOST_PLANES = 10_000  # and crews: an hour of such a fleet takes milliseconds, i
 class AirmeInstance:
     """A fleet and its maintenance crews at hour 0: all planes grounded, all crews free.
 
-    Index p runs over planes. Raises InvalidOptionError if arrays differ in length or a value cannot be.
+    Index p runs over planes. Raises InvalidOptionError if arrays differ in length, two types share a name, or a
+    value cannot be.
     """
 
     n_crews: int
@@ -51,6 +52,9 @@ class AirmeInstance:
         for name, count in (("n_crews", self.n_crews), ("planes", self.n_planes)):
             if not 1 <= count <= MOST_PLANES:
                 return f"{name}: expected 1 to {MOST_PLANES}, got {count}"
+        names = [kind.name for kind in self.types]
+        if len(set(names)) != len(names):
+            return f"types: expected names that differ, got {names}"
         for name in _ARRAYS:
             if getattr(self, name).shape != (self.n_planes,):
                 return f"{name}: expected one value per plane ({self.n_planes}), got {getattr(self, name).shape}"

@@ -290,5 +290,13 @@ def test_published_types_are_those_of_table_6_1() -> None:
 
 
 def test_an_instance_without_planes_raises() -> None:
-    with pytest.raises(InvalidOptionError, match="planes: expected at least one"):
+    with pytest.raises(InvalidOptionError, match="planes: expected 1 to 10000, got 0"):
         AirmeInstance(n_crews=1, kind=[], income=[], hours=[], landings=[], broken=[])
+
+
+def test_an_instance_whose_types_share_a_name_raises() -> None:
+    twins = (PUBLISHED_TYPES[0], PUBLISHED_TYPES[0])
+    with pytest.raises(
+        InvalidOptionError, match=r"types: expected names that differ, got \['fixed_wing', 'fixed_wing'\]"
+    ):
+        AirmeInstance(n_crews=1, kind=[1], income=[1], hours=[0], landings=[0], broken=[False], types=twins)

@@ -109,7 +109,7 @@ class TestIdentity:
             {"hours": [101, 7]},
             {"landings": [15, 1]},
             {"broken": [True, True]},
-            {"types": (FIXED_WING, FIXED_WING)},
+            {"types": (HELICOPTER, FIXED_WING)},
         ],
     )
     def test_changes_with_any_content(self, change: dict[str, Any]) -> None:

@@ -21,7 +21,7 @@ CREW_FIELDS = ("plane", "job_hours", "job_done")
 frail_types = st.lists(
     st.builds(
         AircraftType,
-        name=st.just("frail"),
+        name=st.sampled_from(["frail", "weak"]),
         scales=st.tuples(st.floats(2, 20), st.floats(1, 10)),
         shapes=st.tuples(st.floats(0.8, 6), st.floats(0.8, 6)),
         hour_norm=st.floats(1, 20),
@@ -30,6 +30,7 @@ frail_types = st.lists(
     ),
     min_size=1,
     max_size=2,
+    unique_by=lambda kind: kind.name,
 ).map(tuple)
 
 

@@ -25,6 +25,7 @@ def test_the_figures_have_the_names_that_other_tools_read_and_say_what_they_are_
     threads = torch.get_num_threads()
     figures = bench.bench(AIRME, repeats=1)
     names = {"hour_us_b1", "hour_us_b3", "aec_turns_per_s", "torchrl_decisions_per_s", "policy_ms"}
+    names |= {f"condition_hour_us_{planes}_planes_b{rows}" for planes in (30, 60, 120) for rows in (1, 3)}
     assert set(figures) == names | {"schema", "env", "threads", "repeats", "batch", "statistic", "meaning"}
     assert set(figures["policy_ms"]) == {"small", "large"}
     assert set(figures["meaning"]) == names

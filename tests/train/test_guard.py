@@ -103,14 +103,14 @@ def test_an_interrupted_run_is_saved_at_its_last_update_and_resumes_as_if_it_had
     from tests.train.test_run import GAE, checkpoint
 
     whole = train_from_overrides([*GAE, f"run_dir={tmp_path / 'whole'}"], quiet=True)
-    original = RunLog.update
+    original = RunLog.on_update
 
-    def interrupted(self, values):
-        original(self, values)
+    def interrupted(self, run, values):
+        original(self, run, values)
         if values["update"] == 3:
             os.kill(os.getpid(), signal.SIGTERM)
 
-    monkeypatch.setattr(RunLog, "update", interrupted)
+    monkeypatch.setattr(RunLog, "on_update", interrupted)
     with pytest.raises(SystemExit):
         train_from_overrides([*GAE, f"run_dir={tmp_path / 'stopped'}"], quiet=True)
     monkeypatch.undo()

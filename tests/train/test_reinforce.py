@@ -14,6 +14,7 @@ from marl_sched.agents.networks.deeprm import DeepRMNetwork
 from marl_sched.agents.networks.network import slots_of
 from marl_sched.agents.policies.cards import read_card
 from marl_sched.cli.app import run as run_command
+from marl_sched.domain import get_domain
 from marl_sched.files import read_json, write_json
 from marl_sched.problem import Problem
 from marl_sched.train.algorithms.step_baseline import StepBaseline
@@ -52,7 +53,8 @@ def test_an_update_is_a_step_along_the_gradient_of_reinforce(architecture: str):
     learner = PolicyGradient(Ppo(network, None, config), StepBaseline(discount=0.99, episodes=EPISODES))
     learner.learn(rollout, 0.0, np.random.default_rng(0))
     largest = max(gradient.abs().max() for gradient in expected)
-    assert largest > 1e-4
+    # Adam divides by |gradient| + 1e-8: a step is within 1 % of the learning rate for gradients above 1e-6.
+    assert 0.05 * largest > 1e-6
     for parameter, gradient, old in zip(network.parameters(), expected, before, strict=True):
         assert torch.allclose(parameter.grad, gradient, rtol=1e-3, atol=1e-4 * float(largest))
         # Adam's first step is the learning rate along the sign of the gradient: one step was taken, no more.
@@ -137,7 +139,9 @@ def test_a_policy_is_played_as_it_was_validated(tmp_path: Path):
     assert read_card(directory / "policy.json").mode == "sample"
     assert load_policy(path).mode == "sample"
     assert load_policy(path, mode="greedy").mode == "greedy"
-    problem = Problem("airme", count=2, episodes=1, seed=load_config(overrides).validation.seed, horizon=20)
+    seed = load_config(overrides).validation.seed
+    instances = get_domain("airme").instances("small", 2, seed, "validation")
+    problem = Problem("airme", instances=instances, pad="small", episodes=1, seed=seed, horizon=20)
     scores = evaluate_scheduler(problem, load_policy(path)).measures["profit"]
     assert read_card(directory / "policy.json").scores["validation"]["M1"] == pytest.approx(scores.mean())
     greedy = evaluate_scheduler(problem, load_policy(path, mode="greedy")).measures["profit"]

@@ -183,7 +183,7 @@ def test_a_published_policy_comes_back_from_its_files_and_plays_every_domain(nam
     assert type(again) is PUBLISHED[name]
     assert read.sizes == network.sizes
     assert read_json(path.with_suffix(".json"))["sizes"]["architecture"] == name
-    policy, loaded = NetworkPolicy(network), NetworkPolicy.load(path, graph=simulator.graph)
+    policy, loaded = NetworkPolicy(network, domain=domain), NetworkPolicy.load(path, graph=simulator.graph)
     for _ in range(20):
         choice = policy.decide(simulator)
         assert (loaded.decide(simulator) == choice).all()
