@@ -76,9 +76,11 @@ class ForkServer:
 
     def _obey(self, order: dict[str, Any]) -> None:
         if "start" in order:
+            signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)  # until the new process has its own handlers
             pid = os.fork()
             if pid == 0:
                 self._be(order)
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
             self._pids[pid] = order["start"]
             self._say({"started": order["start"], "pid": pid})
             return
@@ -114,6 +116,7 @@ class ForkServer:
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)
             for number in SIGNALS:
                 signal.signal(number, leave)
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
             os.close(self._alive_write)
             _redirect(Path(order["log"]), keep_stdout=order["role"] == "world")
             end_with(self._alive_read)

@@ -229,7 +229,8 @@ class Deployment:
         """Wait for the end of the run; its report, with the exit codes and restarts of all processes.
 
         `stopped` says by which signal the run is to be ended, None to go on. Raises DeploymentError if the world
-        fails for good, or an agent does before the run has begun; what is lost later is in the report.
+        fails for good, or an agent does before the run has begun; what is lost later is in the report. SystemExit, with
+        128 + n, if the run is to be ended while no world is there that could do it.
         """
         world = self.children[WORLD]
         shown, stop = ("", -1), None
@@ -238,8 +239,8 @@ class Deployment:
                 shown = (self.phase, self.tick)
                 progress(self.phase, self.tick, self.horizon)
             if stop is None and (stop := stopped()) is not None:
-                if not world.pid:
-                    break
+                if not world.pid or self.phase == "starting":  # no world is there that could report its end
+                    sys.exit(128 + stop)
                 self.phase = "over"
                 self.signal(WORLD, stop)
             self.look(POLL)

@@ -204,7 +204,7 @@ def test_frozen_agent_is_given_up_and_comes_back_as_another_incarnation():
 @pytest.mark.slow
 @needs_proc
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
-@pytest.mark.parametrize("at", ["begun", "running"])
+@pytest.mark.parametrize("at", ["begun", "starting", "running"])
 def test_launcher_that_is_ended_leaves_a_report_and_no_process_or_folder(tmp_path, number, at):
     given = world(horizon=10**6)
     code = (
