@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -11,7 +13,7 @@ from marl_sched.agents.networks.hetgat.network import HetGATNetwork
 from marl_sched.agents.policies.network_policy import NetworkPolicy, inverse_distribution
 from marl_sched.domain import get_domain
 from marl_sched.errors import InvalidOptionError
-from marl_sched.graph import ACTION_MASK
+from marl_sched.graph import ACTION_MASK, NodeType
 
 SIZES = {"plane": 9, "crew": 4}
 LOWEST = np.finfo(np.float32).min
@@ -190,3 +192,16 @@ def test_one_pass_is_refused_where_it_would_show_agents_what_the_first_of_them_s
     policy = NetworkPolicy(HetGATNetwork(simulator.graph, width=4, heads=2, layers=2), mode="one_pass")
     with pytest.raises(InvalidOptionError, match=r"one_pass .* is for the full view; got view local"):
         policy.decide(simulator)
+
+
+def test_what_is_pressing_is_found_by_the_names_of_features(fleet):
+    # Broken and seen as it is: slots 1 and 2, of which 2 is not legal. Slot 3 is broken as it was some hours ago.
+    broken, age = np.array([[0, 1, 1, 1, 0]]), np.array([[0, 0, 0, 0.3, 0]])
+    pressing = get_domain("airme").pressing
+    assert pressing is not None
+    for features, columns in ((("broken", "age_hours/10"), (broken, age)), (("age_hours/10", "broken"), (age, broken))):
+        spec = replace(fleet, nodes=(NodeType("plane", features), fleet.node("crew")))
+        seen = {"plane": np.stack(columns, axis=-1), ACTION_MASK: np.array([[1, 1, 0, 1, 1]])}
+        assert pressing(spec, seen).tolist() == [[False, True, False, False, False]]
+    without = replace(fleet, nodes=(NodeType("plane", ("broken", "landings")), fleet.node("crew")))
+    assert not pressing(without, seen).any()
