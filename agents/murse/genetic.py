@@ -99,4 +99,4 @@ def _cost(problem: Round, plan: Plan) -> int:
 
 def _penalty(problem: Round) -> int:
     """More than any feasible makespan."""
-    return int(problem.durations.sum() + np.maximum(problem.lags, 0).sum() + 1)
+    return int(np.maximum(problem.durations, 0).sum() + np.maximum(problem.lags, 0).sum() + 1)

@@ -111,7 +111,7 @@ class _Allocation:
         self._taken: dict[tuple[int, int], Any] = {
             (int(i), int(a)): self._model.new_bool_var(f"{i + 1} by {a}") for i, a in np.argwhere(problem.eligible)
         }
-        largest = self._model.new_int_var(0, int(problem.durations.sum()), "largest workload")
+        largest = self._model.new_int_var(0, int(np.maximum(problem.durations, 0).sum()), "largest workload")
         for i in range(problem.n_tasks):
             self._model.add_exactly_one(taken for (task, _), taken in self._taken.items() if task == i)
         for a in range(problem.n_agents):

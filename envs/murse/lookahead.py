@@ -29,6 +29,7 @@ from marl_sched.envs.murse.graph import (
     UNIT_OF_COUNTS,
     Arrays,
 )
+from marl_sched.envs.murse.instance import INELIGIBLE
 from marl_sched.envs.murse.rollout import (
     HORIZON_SHARE,
     UNREACHABLE,
@@ -57,7 +58,7 @@ class Outlook(NamedTuple):
     """Room for what is worked out of one agent's sight: N tasks, A agents.
 
     Attributes:
-        durations: int64 (N, A), planned, of the tasks in sight and the agents within hearing, else 0.
+        durations: int64 (N, A), planned, of the tasks in sight and the agents within hearing, else INELIGIBLE.
         deadlines, weights: (N,), as in rollout.Problem.
         shortest: int64 (N,), of `durations`.
         latest: int64 (N,), latest starts, the rule's key.
@@ -141,8 +142,8 @@ def take_stock(state: State, b: int, sight: Sight, outlook: Outlook) -> None:
         if sight.known[task] and sight.heard[job.agent]:
             now.ready[job.agent] = max(now.ready[job.agent], sight.finish[task])
         for agent in range(m):
-            usable = sight.seen[task] and sight.heard[agent] and state.pairs[b, task, agent].true > 0
-            outlook.durations[task, agent] = state.pairs[b, task, agent].planned if usable else 0
+            usable = sight.seen[task] and sight.heard[agent] and state.pairs[b, task, agent].true >= 0
+            outlook.durations[task, agent] = state.pairs[b, task, agent].planned if usable else INELIGIBLE
     count, lags, near = 0, state.lags[b], state.near[b]
     for task in range(n):
         now.missing[task], now.earliest[task] = 0, row.clock
@@ -237,7 +238,7 @@ def compare_agents(viewer: int, n_tasks: int, n_agents: int, outlook: Outlook) -
         least, second, best, helper = UNREACHABLE, UNREACHABLE, -1, UNREACHABLE
         if outlook.now.open[task]:
             for agent in range(n_agents):
-                if outlook.durations[task, agent] > 0:
+                if outlook.durations[task, agent] >= 0:
                     finish = finish_by(task, agent, outlook)
                     if finish < least:
                         least, second, best = finish, least, agent
@@ -276,7 +277,7 @@ def breaks(
         if outlook.due[task] > UNREACHABLE // 2 or not now.open[task] or task == taken:
             continue
         before = after = outlook.helpers[task]
-        if outlook.durations[task, viewer] > 0:
+        if outlook.durations[task, viewer] >= 0:
             before, after = min(before, now.ready[viewer]), min(after, until)
         before, after = max(before, now.earliest[task]), max(after, now.earliest[task])
         if taken >= 0:
@@ -301,7 +302,7 @@ def see_ahead(state: State, b: int, viewer: int, sight: Sight, outlook: Outlook,
         if outlook.now.open[task]:
             describe_open_task(out.task[b, task + 1], task, viewer, clock, unit, outlook)
             for agent in range(m):
-                if outlook.durations[task, agent] > 0:
+                if outlook.durations[task, agent] >= 0:
                     there, back = (
                         out.use_time_attributes[b, task + 1, agent],
                         out.take_time_attributes[b, agent, task + 1],
@@ -326,7 +327,7 @@ def describe_open_task(features: np.ndarray, task: int, viewer: int, clock: int,
     if outlook.due[task] < UNREACHABLE // 2:
         features[IS_DUE] = 1.0
         features[TIME_TO_SPARE] = (outlook.due[task] - outlook.now.earliest[task]) / unit
-    if outlook.durations[task, viewer] > 0:
+    if outlook.durations[task, viewer] >= 0:
         features[REGRET] = regret_of(task, viewer, outlook) / unit
         features[REDUCED_COST] = reduced_cost(task, viewer, outlook) / unit
 

@@ -3,7 +3,7 @@
 Latest starts are propagated backwards through deadlines and waits with everybody's shortest durations; a task that
 nothing dates counts against a common horizon. The rule dispatches one pair of task and agent after the other
 (Giffler and Thompson 1960): with F the least possible finish of all pairs, it takes, of the tasks that can start before
-F on their best agent, the one of the least latest start.
+F on their best agent, or end at F, the one of the least latest start.
 
 Tasks and agents that are not known take no part: a task behind a wait for such a task is never dispatched. Times are
 whole units from the round's start.
@@ -29,7 +29,7 @@ class Problem(NamedTuple):
     """What is known of N tasks and A agents; arrays may be longer than what they hold of one round.
 
     Attributes:
-        durations: int64 (N, A), 0 where the pair is ineligible, or the task or the agent unknown.
+        durations: int64 (N, A), INELIGIBLE where the pair is, or where the task or the agent is unknown.
         lags: int64 (N, N) and `near` bool (N, N), as in MurseInstance.
         deadlines: int64 (N,), NO_DEADLINE for none.
         weights: float64 (N,), costs of the weighted completion time.
@@ -98,11 +98,11 @@ def copy_progress(source: Progress, target: Progress) -> None:
 def shortest_durations(durations: np.ndarray, shortest: np.ndarray) -> None:
     """Write int64 (N,), the shortest of each row of int64 (N, A); 0 where nobody is eligible."""
     for task in range(len(durations)):
-        shortest[task] = 0
+        least = UNREACHABLE
         for agent in range(durations.shape[1]):
-            own = durations[task, agent]
-            if own > 0 and (shortest[task] == 0 or own < shortest[task]):
-                shortest[task] = own
+            if durations[task, agent] >= 0:
+                least = min(least, durations[task, agent])
+        shortest[task] = least if least < UNREACHABLE else 0
 
 
 @kernel
@@ -112,7 +112,7 @@ def mean_load(durations: np.ndarray, n_agents: int) -> float:
     for task in range(len(durations)):
         count, own = 0, 0
         for agent in range(durations.shape[1]):
-            if durations[task, agent] > 0:
+            if durations[task, agent] >= 0:
                 count += 1
                 own += durations[task, agent]
         if count > 0:
@@ -167,7 +167,7 @@ def agent_prices(problem: Problem, progress: Progress, prices: np.ndarray) -> No
     useful, least = np.zeros(m, np.bool_), UNREACHABLE
     for agent in range(m):
         for task in range(n):
-            useful[agent] = useful[agent] or (progress.open[task] and problem.durations[task, agent] > 0)
+            useful[agent] = useful[agent] or (progress.open[task] and problem.durations[task, agent] >= 0)
         if useful[agent]:
             least = min(least, progress.ready[agent])
     count = useful.sum()
@@ -184,7 +184,7 @@ def agent_prices(problem: Problem, progress: Progress, prices: np.ndarray) -> No
             best, cheapest = -1, np.inf
             for agent in range(m):
                 cost = problem.durations[task, agent] * present[agent]
-                if problem.durations[task, agent] > 0 and cost < cheapest:
+                if problem.durations[task, agent] >= 0 and cost < cheapest:
                     best, cheapest = agent, cost
             if best >= 0:
                 load[best] += problem.durations[task, best]
@@ -226,7 +226,7 @@ def cheapest_costs(problem: Problem, prices: np.ndarray, cheapest: np.ndarray) -
     for task in range(len(cheapest)):
         cheapest[task] = np.inf
         for agent in range(len(prices)):
-            if problem.durations[task, agent] > 0:
+            if problem.durations[task, agent] >= 0:
                 cheapest[task] = min(cheapest[task], problem.durations[task, agent] * prices[agent])
 
 
@@ -255,7 +255,7 @@ def choose_agent(
     choice.agent[task] = -1
     for agent in range(len(prices)):
         duration = problem.durations[task, agent]
-        if duration == 0:
+        if duration < 0:
             continue
         start = max(progress.earliest[task], progress.ready[agent])
         score = start + duration + charge * (duration * prices[agent] - cheapest)
@@ -295,7 +295,7 @@ def roll_out(
         chosen = -1
         for task in range(n):
             if progress.open[task] and progress.missing[task] == 0 and choice.agent[task] >= 0:
-                in_time = choice.start[task] < least_finish
+                in_time = choice.start[task] < least_finish or choice.finish[task] == least_finish
                 if in_time and (chosen < 0 or latest[task] < latest[chosen]):
                     chosen = task
         if chosen < 0:

@@ -16,7 +16,7 @@ from marl_sched.agents.murse.latest_start import (
     successors,
 )
 from marl_sched.agents.murse.problem import Round, timed
-from marl_sched.envs.murse.instance import NO_DEADLINE
+from marl_sched.envs.murse.instance import INELIGIBLE, NO_DEADLINE
 from tests.murse.problems import instances
 
 
@@ -58,14 +58,14 @@ def test_latest_starts_go_backwards_through_waits_with_shortest_durations():
     # Task 4 has no deadline: it has to end by the horizon of 50 and takes 10.
     lags = np.full((4, 4), -1)
     lags[2, 1], lags[1, 0] = 5, 0
-    durations = np.array([[3, 7], [8, 4], [2, 0], [0, 10]])
+    durations = np.array([[3, 7], [8, 4], [2, INELIGIBLE], [INELIGIBLE, 10]])
     keys = latest_starts(durations, lags, np.array([30, NO_DEADLINE, 20, NO_DEADLINE]), 50.0)
     assert keys.tolist() == [6.0, 9.0, 18.0, 40.0]
 
 
 def test_the_common_horizon_is_1_3_mean_loads_over_eligible_pairs():
     # means 5, 6 and 4 of three tasks for two agents: 1.3 x 15 / 2
-    assert common_horizon(np.array([[3, 7], [6, 6], [4, 0]])) == 1.3 * 15 / 2
+    assert common_horizon(np.array([[3, 7], [6, 6], [4, INELIGIBLE]])) == 1.3 * 15 / 2
 
 
 def test_a_task_that_cannot_start_before_the_least_finish_is_no_candidate():
@@ -74,7 +74,7 @@ def test_a_task_that_cannot_start_before_the_least_finish_is_no_candidate():
     # Task 2 starts at 3 + 9.
     lags = np.full((3, 3), -1)
     lags[1, 2] = 9
-    durations, near = np.array([[5, 0], [4, 0], [0, 3]]), np.zeros((3, 3), bool)
+    durations, near = np.array([[5, INELIGIBLE], [4, INELIGIBLE], [INELIGIBLE, 3]]), np.zeros((3, 3), bool)
     order, agents, starts, finishes = generate(durations, lags, near, np.array([1.0, 0.0, 2.0]))
     assert order.tolist() == [0, 2, 1]
     assert agents.tolist() == [0, 1, 0]
