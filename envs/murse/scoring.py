@@ -6,7 +6,7 @@ import numpy as np
 
 from marl_sched.envs.murse.instance import NO_DEADLINE
 from marl_sched.envs.murse.rules import MAKESPAN, PUBLISHED_REWARD, Rules
-from marl_sched.envs.murse.state import State
+from marl_sched.envs.murse.state import NOBODY, State
 from marl_sched.envs.murse.timetable import longest_round, worst_case
 from marl_sched.kernels import kernel
 
@@ -47,8 +47,10 @@ def evaluate_round(state: State, b: int, consistent: bool) -> None:
         done.agent, done.position, done.committed = job.agent, k, job.committed
         done.start, done.finish = job.start, job.finish
         result.makespan = max(result.makespan, job.finish)
-        result.weighted += job.weight * job.finish
         late = late or (job.deadline != NO_DEADLINE and job.finish > job.deadline)
+    for task in range(n):  # in the order of tasks: rounding shall not tell apart orders of dispatch of the same times
+        if state.executed[b, row.round, task].agent != NOBODY:
+            result.weighted += tasks[task].weight * tasks[task].finish
     result.feasible = consistent and not result.stuck and not late and result.makespan <= result.longest
 
 

@@ -68,6 +68,17 @@ def test_a_round_that_is_played_whole_is_the_one_that_turns_play(instance, name)
             assert np.array_equal(whole.state.executed[0, k][field], turns.state.executed[0, k][field])
 
 
+def test_the_order_of_dispatch_does_not_change_the_result_of_the_same_times():
+    # three tasks of one unit at once: 0.1 + 0.2 + 0.3 and 0.3 + 0.2 + 0.1 differ in the last bit of a float
+    instance = problem([[1, 1, 1]] * 3, weights=[0.1, 0.2, 0.3], proximity="none")
+    results = []
+    for order in ([0, 1, 2], [2, 1, 0]):
+        simulator = MurseSimulator([instance])
+        simulator.play_round(0, np.array(order), np.array(order))
+        results.append(float(simulator.round_results(0)["weighted"][0]))
+    assert results == [0.1 + 0.2 + 0.3] * 2
+
+
 @settings(max_examples=60, deadline=None)
 @given(instances(), st.sampled_from(DISPATCHING_RULES), st.sampled_from(["plan", "online"]))
 def test_what_a_dispatching_rule_achieves_the_validator_confirms(instance, rule, mode):
