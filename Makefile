@@ -5,7 +5,7 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 WHEEL_VENV := build/wheel-venv
-PYTEST_ARGS ?=
+PYTEST_ARGS ?= -n auto --dist worksteal
 
 WORKERS ?= 2
 
@@ -19,7 +19,7 @@ demo: $(INSTALLED) ## seven crews as processes for thirty days, compared with ce
 
 test: unit wheel ## all tests, then the wheel in a second environment
 
-unit: $(INSTALLED) ## the tests alone; PYTEST_ARGS="-n auto -k noise" are pytest's
+unit: $(INSTALLED) ## the tests alone; PYTEST_ARGS="-k noise" are pytest's, by default those that use every core
 	NUMBA_CACHE_DIR=$(CURDIR)/build/numba OMP_NUM_THREADS=1 $(BIN)/pytest $(PYTEST_ARGS)
 
 # The second environment borrows the dependencies of the first through a .pth file; the editable install does not
