@@ -39,8 +39,8 @@ def test_newest_state_of_a_burst_arrives_and_the_turn_behind_it():
         for i in range(200):
             world.put("plane/0/now", b"%d" % i + bytes(400))
         world.put("crew/0/turn", b"turn", control=True)
-        heard = {}
-        while heard.get("crew/0/turn") is None or not heard["plane/0/now"].startswith(b"199"):
+        heard = {"plane/0/now": b"", "crew/0/turn": b""}  # the turn may overtake the states: its priority is higher
+        while not (heard["crew/0/turn"] and heard["plane/0/now"].startswith(b"199")):
             event = agent.receive(30.0)
             heard[event.key] = event.payload
 
