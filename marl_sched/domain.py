@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from gymnasium.spaces import Space
 
     from marl_sched.graph import GraphSpec
+    from marl_sched.sheets import Sheet
     from marl_sched.simulation import TurnSimulator
 
 
@@ -167,6 +168,7 @@ class Domain:
         save_schedules: (simulator, row, path without suffix) -> the files it wrote of a row's ended rounds, for an
             independent check; None: the domain has no such files.
         impossibilities: instance -> why no schedule of it can be feasible, a sentence each; empty if none is known.
+        sheet: how an instance stands in a spreadsheet; None: `marl-sched import` cannot read it.
         demo: what `marl-sched demo` shows; None: nothing.
         pressing: (metagraph, observation of it) -> the legal actions, bool (B, n_actions), one of which a greedy policy
             takes before it does nothing; None: there are none such.
@@ -202,6 +204,7 @@ class Domain:
     impossibilities: Callable[[Any], list[str]] = _none_known
     instance_files: Callable[[Path], list[Path]] = _json_files
     save_schedules: Callable[[Any, int, Path], list[Path]] | None = None
+    sheet: Sheet | None = None
     demo: Demo | None = None
     pressing: Callable[[GraphSpec, Mapping[str, np.ndarray]], np.ndarray] | None = None
     legend: Mapping[str, Sequence[int]] | None = None

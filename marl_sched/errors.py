@@ -41,6 +41,15 @@ class InvalidFileError(MarlSchedError, ValueError):
         self.path, self.field = str(path), field
 
 
+class InvalidSheetError(InvalidFileError):
+    """A spreadsheet with cells that do not hold what they should; `lines` has one complaint for each of them."""
+
+    def __init__(self, path: object, lines: Iterable[str]) -> None:
+        self.lines = list(lines)
+        MarlSchedError.__init__(self, "\n".join(self.lines))
+        self.path, self.field = str(path), ""
+
+
 class InvalidOptionError(MarlSchedError, ValueError):
     """An option outside its domain, such as a negative reach or a horizon of zero hours."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -29,19 +29,23 @@ class AircraftType:
     hour_norm: float
     usage: float  # probability that a grounded, healthy plane starts a mission in an hour
     income: tuple[float, float]  # bounds of the uniform hourly income
+    # What the parts are called, () for no names; neither the noise nor whether two types are the same depends on it.
+    parts: tuple[str, ...] = field(default=(), repr=False, compare=False)
 
     def __post_init__(self) -> None:
         """Bring the numbers to plain floats, so that equal types hash alike, and refuse a type that cannot be."""
-        for field in ("scales", "shapes", "income"):
-            object.__setattr__(self, field, tuple(float(value) for value in getattr(self, field)))
-        for field in ("hour_norm", "usage"):
-            object.__setattr__(self, field, float(getattr(self, field)))
+        for name in ("scales", "shapes", "income"):
+            object.__setattr__(self, name, tuple(float(value) for value in getattr(self, name)))
+        for name in ("hour_norm", "usage"):
+            object.__setattr__(self, name, float(getattr(self, name)))
         where = f"aircraft type {self.name!r}"
         if not self.scales or len(self.scales) != len(self.shapes):
             raise InvalidOptionError(
                 f"{where}: expected as many scales as shapes and at least one, "
                 f"got {len(self.scales)} scales and {len(self.shapes)} shapes"
             )
+        if self.parts and len(self.parts) != len(self.scales):
+            raise InvalidOptionError(f"{where}: expected {len(self.scales)} names of parts, got {len(self.parts)}")
         if not all(0 < value < math.inf for value in (*self.scales, *self.shapes, self.hour_norm)):
             raise InvalidOptionError(f"{where}: scales, shapes and hour_norm must be finite and > 0")
         if not 0 <= self.usage <= 1:

@@ -42,4 +42,5 @@ AIRME = Domain(
     pressing=pressing,
     legend=render.LEGEND,
     band=("plane", render.CELL),
+    sheet=lazy("marl_sched.envs.airme.sheet:FLEET"),
 )

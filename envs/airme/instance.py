@@ -16,7 +16,7 @@ from marl_sched.errors import InvalidFileError, InvalidOptionError, UnknownNameE
 from marl_sched.files import read_json, write_json
 from marl_sched.structs import convert
 
-SCHEMA = 1
+SCHEMA = 2  # 1 had no names of planes and parts
 MOST_INCOME = 1e9  # sums over a fleet stay finite
 MOST = 1_000_000  # of hours and landings, which index failure tables: beyond this a file is wrong, not large
 MOST_PLANES = 10_000  # and crews: an hour of such a fleet takes milliseconds, its observation megabytes
@@ -37,6 +37,8 @@ class AirmeInstance:
     landings: np.ndarray  # int32 (P,), landings since the last repair
     broken: np.ndarray  # bool (P,)
     types: tuple[AircraftType, ...] = PUBLISHED_TYPES
+    names: tuple[str, ...] = ()  # what planes are called, such as their tail numbers; () for no names
+    noise_of: int | None = None  # the identity of another fleet, whose noise this one is to meet; None: its own
 
     def __post_init__(self) -> None:
         """Bring the arrays to their dtypes, make them read-only, and check them."""
@@ -55,6 +57,8 @@ class AirmeInstance:
         names = [kind.name for kind in self.types]
         if len(set(names)) != len(names):
             return f"types: expected names that differ, got {names}"
+        if self.names and (len(self.names) != self.n_planes or len(set(self.names)) != self.n_planes):
+            return f"names: expected a name for each of {self.n_planes} planes, all different, got {len(self.names)}"
         for name in _ARRAYS:
             if getattr(self, name).shape != (self.n_planes,):
                 return f"{name}: expected one value per plane ({self.n_planes}), got {getattr(self, name).shape}"
@@ -76,7 +80,9 @@ class AirmeInstance:
 
     @cached_property
     def identity(self) -> int:
-        """A 64-bit hash of the content: the instance's name in counter-based randomness."""
+        """A 64-bit hash of the content, names left out: the instance's name in counter-based randomness."""
+        if self.noise_of is not None:
+            return self.noise_of
         digest = blake2b(digest_size=8)
         digest.update(repr((self.n_crews, self.types)).encode())
         for name, dtype in _ARRAYS.items():
@@ -87,6 +93,7 @@ class AirmeInstance:
         """Plain data, one object per plane, from which `decode` makes the instance again."""
         planes = [
             {
+                **({"name": self.names[p]} if self.names else {}),
                 "type": self.types[self.kind[p]].name,
                 "income": float(self.income[p]),
                 "hours": int(self.hours[p]),
@@ -96,6 +103,9 @@ class AirmeInstance:
             for p in range(self.n_planes)
         ]
         types = [asdict(kind) for kind in self.types]
+        for kind in types:
+            if not kind["parts"]:
+                del kind["parts"]
         return {"schema": SCHEMA, "env": "airme", "n_crews": self.n_crews, "types": types, "planes": planes}
 
     def save(self, path: str | Path) -> None:
@@ -175,6 +185,7 @@ class _Type(Struct, forbid_unknown_fields=True):
     hour_norm: Annotated[float, Meta(gt=0, description="a number > 0")]
     usage: Annotated[float, Meta(ge=0, le=1, description="a probability in [0, 1]")]
     income: Annotated[list[float], Meta(min_length=2, max_length=2, description=_INCOME_BOUNDS)]
+    parts: Annotated[list[str], Meta(description="names, as many as scales")] = []
 
 
 class _Plane(Struct, forbid_unknown_fields=True):
@@ -185,12 +196,13 @@ class _Plane(Struct, forbid_unknown_fields=True):
     hours: Annotated[int, Meta(ge=0, le=MOST, description=f"an integer in [0, {MOST}]")]
     landings: Annotated[int, Meta(ge=0, le=MOST, description=f"an integer in [0, {MOST}]")]
     broken: Annotated[bool, Meta(description="true or false")]
+    name: Annotated[str, Meta(min_length=1, description="a name, such as a tail number")] | None = None
 
 
 class _File(Struct, forbid_unknown_fields=True):
     """An instance as a file has it."""
 
-    schema: Annotated[Literal[1], Meta(description=f"{SCHEMA}")]
+    schema: Annotated[Literal[1, 2], Meta(description="1 or 2")]
     env: Annotated[Literal["airme"], Meta(description="'airme'")]
     n_crews: Annotated[int, Meta(ge=1, le=MOST_PLANES, description=f"an integer in [1, {MOST_PLANES}]")]
     types: Annotated[list[_Type], Meta(min_length=1, description="a list that is not empty")]
@@ -214,11 +226,18 @@ def decode(data: Any, where: str | Path) -> AirmeInstance:
     for p, plane in enumerate(file.planes):
         if plane.type not in names:
             raise InvalidFileError(where, f"planes[{p}].type", f"one of {[*names]}", plane.type)
+    called = [plane.name for plane in file.planes if plane.name is not None]
+    if called and (len(called) != len(file.planes) or len(set(called)) != len(called)):
+        raise InvalidFileError(where, "planes", "a name for every plane, all different, or for none", called)
     return AirmeInstance(
         n_crews=file.n_crews,
         types=types,
+        names=tuple(called),
         kind=np.array([names[plane.type] for plane in file.planes]),
-        **{name: np.array([getattr(plane, name) for plane in file.planes]) for name in _ARRAYS if name != "kind"},
+        income=np.array([plane.income for plane in file.planes]),
+        hours=np.array([plane.hours for plane in file.planes]),
+        landings=np.array([plane.landings for plane in file.planes]),
+        broken=np.array([plane.broken for plane in file.planes]),
     )
 
 
@@ -226,6 +245,8 @@ def _as_type(kind: _Type, place: str, where: str | Path) -> AircraftType:
     """A type of the fleet; what one field alone cannot show is checked here."""
     if len(kind.shapes) != len(kind.scales):
         raise InvalidFileError(where, f"{place}.shapes", f"{len(kind.scales)} numbers > 0", kind.shapes)
+    if kind.parts and len(kind.parts) != len(kind.scales):
+        raise InvalidFileError(where, f"{place}.parts", f"{len(kind.scales)} names", kind.parts)
     low, high = kind.income
     if not 0 < low <= high <= MOST_INCOME:
         raise InvalidFileError(where, f"{place}.income", _INCOME_BOUNDS, kind.income)
@@ -236,4 +257,5 @@ def _as_type(kind: _Type, place: str, where: str | Path) -> AircraftType:
         hour_norm=kind.hour_norm,
         usage=kind.usage,
         income=(low, high),
+        parts=tuple(kind.parts),
     )

@@ -39,4 +39,5 @@ MURSE = Domain(
     impossibilities=MurseInstance.impossibilities,
     instance_files=instance_files,
     save_schedules=lazy("marl_sched.envs.murse.schedule:save_schedules"),
+    sheet=lazy("marl_sched.envs.murse.sheet:TASKS"),
 )

@@ -52,6 +52,9 @@ class MurseInstance:
     duration_range: tuple[int, int] = (15, 100)
     n_rounds: int = 1
     map_width: float = 5.0
+    task_names: tuple[str, ...] = ()  # what people call the tasks; () for no names, they then are "task 1" and so on
+    agent_names: tuple[str, ...] = ()  # likewise, robots first
+    noise_of: int | None = None  # the identity of another problem, whose noise this one is to meet; None: its own
 
     def __post_init__(self) -> None:
         """Bring the arrays to their dtypes, make them read-only, and check them."""
@@ -90,6 +93,12 @@ class MurseInstance:
         for name, known in (("proximity", PROXIMITY), ("learning", LEARNING), ("durations", DURATIONS)):
             if getattr(self, name) not in known:
                 return f"{name}: expected one of {', '.join(known)}, got {getattr(self, name)!r}"
+        for name, given, count in (
+            ("task_names", self.task_names, self.n_tasks),
+            ("agent_names", self.agent_names, self.n_agents),
+        ):
+            if given and (len(given) != count or len(set(given)) != count):
+                return f"{name}: expected {count} names that differ, got {len(given)}"
         for name, good, expected in (
             ("duration_range", 1 <= low <= high, "two integers 1 <= low <= high"),
             ("n_rounds", self.n_rounds >= 1, "an integer >= 1"),
@@ -195,8 +204,10 @@ class MurseInstance:
         """A 64-bit hash of tasks, team and constraints: the instance's name in counter-based randomness.
 
         The settings (proximity, learning, durations, rounds) are left out, so that a team draws the same
-        noise under each of them.
+        noise under each of them; so are the names.
         """
+        if self.noise_of is not None:
+            return self.noise_of
         digest = blake2b(repr(self.duration_range).encode(), digest_size=8)
         for name, dtype in _ARRAYS.items():
             array = getattr(self, name)
@@ -240,7 +251,15 @@ class MurseInstance:
 
     def as_json(self) -> dict[str, object]:
         """Plain data, one object per task, from which `reading.decode` makes the instance again; tasks count from 1."""
-        return {"schema": SCHEMA, "env": "murse", **self._settings(), "tasks": self._tasks()}
+        names = {"agent_names": list(self.agent_names)} if self.agent_names else {}
+        return {"schema": SCHEMA, "env": "murse", **self._settings(), **names, "tasks": self._tasks()}
+
+    @property
+    def called(self) -> tuple[list[str], list[str]]:
+        """What tasks and agents are called: their names, or "task 1", "robot 0" and "human 1"."""
+        kinds = ["robot" if a < self.n_robots else "human" for a in range(self.n_agents)]
+        tasks = list(self.task_names) or [f"task {i + 1}" for i in range(self.n_tasks)]
+        return tasks, list(self.agent_names) or [f"{kind} {a}" for a, kind in enumerate(kinds)]
 
     def save(self, path: str | Path) -> None:
         """Write `as_json` to a file, whole or not at all."""
@@ -256,6 +275,7 @@ class MurseInstance:
         ahead = self.waits_by_task()
         return [
             {
+                **({"name": self.task_names[i]} if self.task_names else {}),
                 "robots": [None if d == INELIGIBLE else int(d) for d in self.robot_durations[i]],
                 "humans": [dict(zip(CURVE, curve.tolist(), strict=True)) for curve in self.curves[i]],
                 "deadline": None if self.deadlines[i] == NO_DEADLINE else int(self.deadlines[i]),

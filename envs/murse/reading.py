@@ -41,6 +41,7 @@ class _Task(msgspec.Struct, forbid_unknown_fields=True):
     deadline: _Natural | None = None
     waits: list[_Wait] = []
     weight: _Magnitude = 1.0
+    name: str | None = None
 
 
 class _File(msgspec.Struct, forbid_unknown_fields=True):
@@ -56,6 +57,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     durations: Literal["deterministic", "stochastic"] = "deterministic"
     duration_range: tuple[_Count, _Count] = (15, 100)
     map_width: _Positive = 5.0
+    agent_names: list[str] = []
 
 
 def load(path: str | Path) -> MurseInstance:
@@ -100,4 +102,6 @@ def _instance(file: _File) -> MurseInstance:
         duration_range=file.duration_range,
         n_rounds=file.n_rounds,
         map_width=file.map_width,
+        task_names=tuple(task.name for task in tasks if task.name is not None),
+        agent_names=tuple(file.agent_names),
     )

@@ -11,8 +11,8 @@ from typing import Annotated, Any
 
 import typer
 
-from marl_sched.cli import bound, demo, deployment, evaluation, information, pages, problems, training
-from marl_sched.errors import MarlSchedError
+from marl_sched.cli import bound, demo, deployment, evaluation, information, pages, problems, sheets, training
+from marl_sched.errors import InvalidSheetError, MarlSchedError
 
 app = typer.Typer(
     name="marl-sched",
@@ -22,7 +22,7 @@ app = typer.Typer(
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
 )
-for group in (problems, evaluation, pages, bound, training, deployment, demo, information):
+for group in (problems, sheets, evaluation, pages, bound, training, deployment, demo, information):
     group.add_to(app)
 
 # Newer typer ships click inside itself, older ones depend on it: the base of all its errors of usage is reached
@@ -81,6 +81,8 @@ def run(arguments: Sequence[str] | None = None) -> int:
         code = app(args=None if arguments is None else list(arguments), standalone_mode=False)
     except _UsageError as error:
         return _refuse(error.format_message())
+    except InvalidSheetError as error:
+        return max(_refuse(line) for line in error.lines)
     except MarlSchedError as error:
         return _refuse(str(error))
     except ModuleNotFoundError as error:

@@ -53,6 +53,25 @@ def takes(group: type) -> Callable[[Callable[..., None]], Callable[..., None]]:
     return wrap
 
 
+def takes_own(command: Callable[..., None]) -> Callable[..., None]:
+    """Turn a command whose first parameter is an OwnOptions into one that hands it what it does not know itself.
+
+    Register it with DOMAIN_OPTIONS.
+    """
+    parameters = list(inspect.signature(command, eval_str=True).parameters.values())[1:]
+    context = inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
+
+    def call(context: typer.Context, **given: Any) -> None:
+        known = [option for parameter in context.command.params for option in parameter.opts]
+        command(OwnOptions(parse_options(context.args), known), **given)
+
+    keyword = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in parameters]
+    call.__name__, call.__doc__ = command.__name__, command.__doc__
+    call.__signature__ = inspect.Signature([context, *keyword])  # type: ignore[attr-defined]  # what inspect looks for
+    call.__annotations__ = {parameter.name: parameter.annotation for parameter in [context, *keyword]}
+    return call
+
+
 def parse_options(arguments: Sequence[str]) -> dict[str, str]:
     """`--reach 1 --fast=yes` as {"reach": "1", "fast": "yes"}; InvalidOptionError for what has another form."""
     words: dict[str, str] = {}

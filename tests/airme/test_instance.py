@@ -140,7 +140,7 @@ class TestFile:
     @pytest.mark.parametrize(
         ("break_it", "message"),
         [
-            (lambda d: d.update(schema=2), "schema: expected 1, got 2"),
+            (lambda d: d.update(schema=3), "schema: expected 1 or 2, got 3"),
             (lambda d: d.update(env="murse"), "env: expected 'airme', got 'murse'"),
             (lambda d: d.pop("n_crews"), "n_crews: expected an integer in [1, 10000]; the field is missing"),
             (lambda d: d.update(n_crews=0), "n_crews: expected an integer in [1, 10000], got 0"),

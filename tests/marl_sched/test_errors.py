@@ -55,6 +55,7 @@ def every_kind():
     special = {
         UnknownNameError: UnknownNameError("view", "ful", ["full", "local"]),
         InvalidFileError: InvalidFileError("a.json", "planes", "a list", lambda: "no pickle takes this"),
+        errors.InvalidSheetError: errors.InvalidSheetError("a.csv", ["a.csv: row 2", "a.csv: row 3"]),
     }
     return [special.get(kind) or kind("what, where, expected, got") for kind in kinds]
 
