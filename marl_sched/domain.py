@@ -23,6 +23,7 @@ from marl_sched.plugins import DOMAINS, import_object, load_offered, offered
 
 if TYPE_CHECKING:
     from gymnasium.spaces import Space
+    from matplotlib.figure import Figure
 
     from marl_sched.graph import GraphSpec
     from marl_sched.sheets import Sheet
@@ -108,6 +109,23 @@ def _json_files(folder: Path) -> list[Path]:
     return sorted(folder.glob("*.json"))
 
 
+class Fitted(Protocol):
+    """What was estimated from records."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain data of a file that the domain's own `import` reads."""
+
+    def table(self) -> tuple[list[str], list[list[str]]]:
+        """Headings and rows, for people."""
+
+    @property
+    def remark(self) -> str:
+        """What the numbers mean where they go, a sentence or two."""
+
+    def figure(self) -> Figure:
+        """A picture of records and estimates; needs matplotlib."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Demo:
     """What `marl-sched demo` shows of a domain: one deployed episode, then a comparison on other instances.
@@ -169,6 +187,8 @@ class Domain:
             independent check; None: the domain has no such files.
         impossibilities: instance -> why no schedule of it can be feasible, a sentence each; empty if none is known.
         sheet: how an instance stands in a spreadsheet; None: `marl-sched import` cannot read it.
+        records: the spreadsheet of what `marl-sched fit` estimates parameters from; reading it gives a `Fitted`; None:
+            there is nothing to fit.
         demo: what `marl-sched demo` shows; None: nothing.
         pressing: (metagraph, observation of it) -> the legal actions, bool (B, n_actions), one of which a greedy policy
             takes before it does nothing; None: there are none such.
@@ -205,6 +225,7 @@ class Domain:
     instance_files: Callable[[Path], list[Path]] = _json_files
     save_schedules: Callable[[Any, int, Path], list[Path]] | None = None
     sheet: Sheet | None = None
+    records: Sheet | None = None
     demo: Demo | None = None
     pressing: Callable[[GraphSpec, Mapping[str, np.ndarray]], np.ndarray] | None = None
     legend: Mapping[str, Sequence[int]] | None = None

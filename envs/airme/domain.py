@@ -43,4 +43,5 @@ AIRME = Domain(
     legend=render.LEGEND,
     band=("plane", render.CELL),
     sheet=lazy("marl_sched.envs.airme.sheet:FLEET"),
+    records=lazy("marl_sched.envs.airme.fitting:RECORDS"),
 )

@@ -162,6 +162,16 @@ def check_output(path: Path | None, option: str = "--json") -> None:
     check_folder(path.parent, option)
 
 
+PICTURES = (".png", ".svg", ".pdf")
+
+
+def check_picture(path: Path | None, option: str) -> None:
+    """Refuse a picture that could not be written, or whose suffix is of no known format."""
+    if path is not None and path.suffix.lower() not in PICTURES:
+        raise InvalidOptionError(f"{option}: expected a name that ends in {', '.join(PICTURES)}, got {str(path)!r}")
+    check_output(path, option)
+
+
 def check_folder(path: Path, option: str = "--out") -> None:
     """Refuse a folder that is not there and cannot be made, or that nothing can be written into."""
     there = next(folder for folder in (path.absolute(), *path.absolute().parents) if folder.exists())

@@ -1,4 +1,4 @@
-"""`marl-sched template` and `import`: problems from spreadsheets."""
+"""`marl-sched template`, `import` and `fit`: problems and parameters from spreadsheets."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from marl_sched.domain import Domain, Instance
     from marl_sched.sheets import Sheet
 
-ROWS = "rows"
+ROWS, RECORDS = "rows", "records"
 
 
 def add_to(app: typer.Typer) -> None:
@@ -24,22 +24,28 @@ def add_to(app: typer.Typer) -> None:
     app.command(epilog=f"Example: marl-sched template {options.DEFAULT_ENV} --out sheet.csv")(template)
     example = "Example: marl-sched import fleet.csv --crews 5 --out fleet.json"
     app.command("import", epilog=example, context_settings=DOMAIN_OPTIONS)(takes_own(import_sheet))
+    example = "Example: marl-sched fit failures.csv --out types.json --plot fit.png"
+    app.command(epilog=example, context_settings=DOMAIN_OPTIONS)(takes_own(fit))
 
 
 def template(
     env: Annotated[str, typer.Argument(help="The environment.")],
     what: Annotated[
-        str, typer.Argument(help="rows, or a setting that is a file of its own, which is shown if unknown.")
+        str, typer.Argument(help="rows, records (for `fit`), or a setting that is a file of its own.")
     ] = ROWS,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FILE", help="Write it here (default: standard output).")
     ] = None,
 ) -> None:
     """Write a spreadsheet to begin with: headings, examples, and what every column means."""
+    from marl_sched.domain import get_domain
     from marl_sched.files import replacing
 
     sheet = require_sheet(env)
     templates = {ROWS: sheet.template, **{one.name: one.template for one in sheet.settings if one.template}}
+    records = get_domain(env).records
+    if records is not None:
+        templates[RECORDS] = records.template
     if what not in templates:
         raise UnknownNameError(f"template of {env}", what, templates)
     text = templates[what]()
@@ -66,6 +72,39 @@ def import_sheet(
     instance.save(out)
     options.warn_of_impossible(domain, {str(out): instance})
     typer.echo(out)
+
+
+def fit(
+    own: OwnOptions,
+    records: Annotated[Path, typer.Argument(metavar="FILE.csv", help="The records, see `template ENV records`.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE", help="The parameters as JSON, for --types of `import`.")
+    ] = None,
+    plot: Annotated[
+        Path | None, typer.Option("--plot", metavar="FILE", help="A picture, in the format of its suffix.")
+    ] = None,
+    env: options.Env = options.DEFAULT_ENV,
+) -> None:
+    """Estimate parameters from records of failures, with intervals; parts that have not failed yet count."""
+    from marl_sched.cli.tables import print_rows
+    from marl_sched.domain import Fitted, get_domain
+    from marl_sched.files import write_json
+    from marl_sched.sheet_reading import read_sheet
+
+    sheet = get_domain(env).records
+    if sheet is None:
+        raise InvalidOptionError(f"--env: the environment {env!r} has no parameters to fit")
+    options.check_output(out, "--out")
+    options.check_picture(plot, "--plot")
+    fitted: Fitted = read_sheet(sheet, records, own.words)
+    print_rows(*fitted.table(), caption=fitted.remark)
+    if out is not None:
+        write_json(out, fitted.as_json())
+        typer.echo(out)
+    if plot is not None:
+        from marl_sched.train.evaluation.plots import save
+
+        typer.echo(save(fitted.figure(), plot))
 
 
 def require_sheet(env: str) -> Sheet:

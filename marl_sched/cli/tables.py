@@ -10,6 +10,7 @@ from typing import Any
 
 from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 from tabulate import tabulate
 
@@ -141,6 +142,23 @@ def _caption(results: dict[str, Any]) -> str:
         f"difference: paired, to {baseline['scheduler']} with the {baseline['view']['kind']} view. "
         "±: over instances; 95 percent intervals: [ ] over such instances, ( ) over other noise on these instances"
     )
+
+
+def print_rows(
+    headings: list[str], rows: list[list[str]], *, title: str = "", caption: str = "", stderr: bool = False
+) -> None:
+    """A table of texts: never a cell less than there is, however narrow the terminal; the caption below it."""
+    console = Console(stderr=stderr)
+    table = Table(title=title or None, box=box.SIMPLE_HEAD, title_justify="left")
+    for heading in headings:
+        table.add_column(heading, no_wrap=True)
+    for row in rows:
+        table.add_row(*map(escape, row))
+    widths = [max(map(len, cells)) for cells in zip(headings, *rows, strict=True)]
+    needed = sum(widths) + 3 * len(widths) + 2
+    Console(file=console.file, width=max(console.width, needed)).print(table)
+    if caption:
+        console.print(caption, highlight=False, markup=False)
 
 
 def print_bench(figures: dict[str, Any], *, stderr: bool = False) -> None:

@@ -48,3 +48,22 @@ def test_a_sheet_of_no_environment_is_refused(run, tmp_path):
     (tmp_path / "sheet.csv").write_text("a,b\n1,2\n")
     ended = run("import", tmp_path / "sheet.csv", "--out", tmp_path / "fleet.json")
     assert (ended.code, "row 1: expected the headings of one of airme, murse" in ended.err) == (2, True)
+
+
+def test_records_are_fitted_into_a_file_of_types_and_a_picture(run, tmp_path):
+    (tmp_path / "records.csv").write_text(run("template", "airme", "records").out)
+    words = ("--out", tmp_path / "types.json", "--plot", tmp_path / "fit.svg")
+    ended = run("fit", tmp_path / "records.csv", *words)
+    assert ended.code == 0, ended.err
+    assert "turboprop" in ended.out
+    assert "only with --failure hazard" in " ".join(ended.out.split())
+    part = json.loads((tmp_path / "types.json").read_text())["types"][0]["parts"][0]
+    assert (part["failures"], part["censored"]) == (2, 1)
+    assert part["scale_interval"][0] < part["scale"] < part["scale_interval"][1]
+    assert (tmp_path / "fit.svg").read_text().startswith("<?xml")
+
+
+def test_a_picture_of_no_known_format_is_refused_before_the_work(run, tmp_path):
+    (tmp_path / "records.csv").write_text(run("template", "airme", "records").out)
+    ended = run("fit", tmp_path / "records.csv", "--plot", tmp_path / "fit.bmp")
+    assert (ended.code, "--plot: expected a name that ends in .png, .svg, .pdf" in ended.err) == (2, True)
