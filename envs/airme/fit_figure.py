@@ -47,7 +47,9 @@ def _survival(axes: Any, part: PartFit, usage: np.ndarray) -> None:
     x = np.concatenate([[0.0], recorded.quantiles])
     axes.step(x, np.concatenate([[1.0], recorded.probabilities]), where="post", color=_INK, lw=1.2, label="recorded")
     if len(failed) > 1:
-        low, high = recorded.confidence_interval(method="log-log")
+        with warnings.catch_warnings():  # where nobody or everybody has failed there is no interval: drawn from 0 to 1
+            warnings.filterwarnings("ignore", "The confidence interval is undefined", RuntimeWarning)
+            low, high = (end.probabilities for end in recorded.confidence_interval(method="log-log"))
         ends = [
             np.concatenate([[1.0], np.nan_to_num(end.probabilities, nan=value)]) for end, value in ((low, 0), (high, 1))
         ]
