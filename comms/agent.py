@@ -153,10 +153,13 @@ def load_policy(policy: str, domain: Any) -> ObservationScheduler:
 
 def run(options: AgentOptions, progress: Any = None) -> Counter[str]:
     """Be one agent of a run until it is over; see Agent.run for what it raises. Signals end it with a goodbye."""
+    from marl_sched.comms.security.refusals import log_warnings
     from marl_sched.comms.transport.zenoh_session import spoke
 
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # one decision is too small to share, and stays bit-equal
-    transport = spoke(options.run, options.connect, options.join_timeout, options.lease)
+    log_warnings()
+    identity = options.identity()
+    transport = spoke(options.run, options.connect, options.join_timeout, options.lease, identity=identity)
     try:
         with interruptible(transport):
             return Agent(options, transport).run()

@@ -16,6 +16,7 @@ import json
 import logging
 import os
 import selectors
+import shutil
 import signal
 import sys
 import time
@@ -162,7 +163,10 @@ def warm_up(world: Any, policies: list[str]) -> None:
 
 
 def main() -> None:
-    """The process: `python -m marl_sched.comms.fork_server '{"world": {...}, "policies": [...]}'`."""
+    """The process: `python -m marl_sched.comms.fork_server '{"world": {...}, "policies": [...], "remove": null}'`.
+
+    `remove` is a folder that goes when the process ends.
+    """
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
     from marl_sched.comms import agent, world
     from marl_sched.comms.options import AgentOptions, WorldOptions
@@ -180,6 +184,8 @@ def main() -> None:
             "agent": (AgentOptions, agent.run, lambda counts: 0),
         }
     ).run()
+    if asked["remove"]:  # the run's private keys: they go even if the parent was killed
+        shutil.rmtree(asked["remove"], ignore_errors=True)
 
 
 if __name__ == "__main__":

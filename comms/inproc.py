@@ -73,7 +73,7 @@ class Bus:
         """Give a query to the first node that serves its key."""
         with self.lock:
             for node in self.nodes:
-                if key in node.served:
+                if any(fnmatchcase(key, pattern) for pattern in node.served):
                     self._last_query += 1
                     self.queries[self._last_query] = (asker, question)
                     node.inbox.put(("query", self._last_query), Queried(key, payload, self._last_query))

@@ -28,12 +28,13 @@ from marl_sched.comms.metrics.report import SCHEMA
 from marl_sched.comms.options import AgentOptions, DeployOptions
 from marl_sched.comms.process import SIGNALS
 from marl_sched.comms.protocol.events import Ending, ExitCode
-from marl_sched.comms.transport.endpoints import settle_port
+from marl_sched.comms.security.certificates import make_certificates
+from marl_sched.comms.security.identity import WORLD, Identity
+from marl_sched.comms.transport.endpoints import is_encrypted, settle_port
 from marl_sched.domain import Domain
 from marl_sched.errors import DeploymentError
 from marl_sched.files import read_json, write_json
 
-WORLD = "world"
 POLL = 0.05  # seconds between two looks at the processes
 LEAVE = 10.0  # seconds that processes have to leave when the run is over or interrupted
 FIRST_DELAY, LAST_DELAY, STEADY = 0.1, 5.0, 30.0  # seconds: until a restart, at most, and alive until that is forgotten
@@ -88,11 +89,14 @@ class Deployment:
         for policy in sorted(set(self.policies)):
             _check_policy(policy, options.world.domain())
         self.endpoint = settle_port(options.world.listen)
+        self.certs = options.world.certs  # a folder; while the run lasts one of its own, unless one is given
+        if self.certs:
+            self._check_certificates(Path(self.certs))
         self.children: dict[str, Child] = {}
         self.phase, self.tick, self.horizon = "starting", 0, options.world.horizon
         self._said: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
         self._server: subprocess.Popen[bytes] | None = None
-        self._kept = bool(options.folder)
+        self._kept, self._own_certs = bool(options.folder), ""
 
     def __enter__(self) -> Deployment:
         """Start all processes."""
@@ -103,11 +107,13 @@ class Deployment:
             self.folder = Path(tempfile.mkdtemp(prefix="marl_sched-"))
         self.report_path = self.folder / "report.json"
         try:
+            if is_encrypted(self.endpoint) and not self.certs:
+                self.certs = self._own_certs = tempfile.mkdtemp(prefix="marl_sched-certs-")
+                make_certificates(Path(self.certs), [self._name(agent) for agent in range(self._n_agents)])
             self._start_server()
             self._add(WORLD, self.start_world)
             for agent in self.started_here:
-                name = self.options.world.domain().agent_name(agent)
-                self._add(name, lambda agent=agent: self.start_agent(agent))  # type: ignore[misc]  # a bound default
+                self._add(self._name(agent), lambda agent=agent: self.start_agent(agent))  # type: ignore[misc]  # a bound default
         except BaseException:
             self.close()
             raise
@@ -117,9 +123,18 @@ class Deployment:
         """End all processes."""
         self.close()
 
+    def _name(self, agent: int) -> str:
+        return self.options.world.domain().agent_name(agent)
+
+    def _check_certificates(self, folder: Path) -> None:
+        for name in (WORLD, *(self._name(agent) for agent in self.started_here)):
+            Identity(folder, name)
+
     def _start_server(self) -> None:
         world = replace(self.options.world, listen=self.endpoint)
-        asked = json.dumps({"world": asdict(world), "policies": sorted(set(self.policies))})
+        asked = json.dumps(
+            {"world": asdict(world), "policies": sorted(set(self.policies)), "remove": self._own_certs or None}
+        )
         with (self.folder / "fork_server.log").open("ab") as log:
             self._server = subprocess.Popen(
                 [sys.executable, "-P", "-m", "marl_sched.comms.fork_server", asked],
@@ -162,7 +177,9 @@ class Deployment:
         """Start the world's process; again, if it has died, and then it goes on from its log."""
         self.phase = "starting"
         log = self.options.world.log or str(self.folder / "run.jsonl")
-        options = replace(self.options.world, listen=self.endpoint, report=str(self.report_path), log=log)
+        options = replace(
+            self.options.world, listen=self.endpoint, report=str(self.report_path), log=log, certs=self.certs
+        )
         self._start(WORLD, "world", asdict(options))
 
     def start_agent(self, agent: int) -> None:
@@ -172,10 +189,11 @@ class Deployment:
             policy=self.policies[agent],
             run=self.options.world.run,
             connect=self.endpoint,
+            certs=self.certs,
             join_timeout=self.options.world.ready_timeout,
             lease=self.options.world.lease,
         )
-        self._start(self.options.world.domain().agent_name(agent), "agent", asdict(options))
+        self._start(self._name(agent), "agent", asdict(options))
 
     def _start(self, name: str, role: str, options: dict[str, Any]) -> None:
         child = self.children[name]
@@ -273,6 +291,8 @@ class Deployment:
             except subprocess.TimeoutExpired:
                 server.kill()
                 server.wait()
+        if self._own_certs:
+            shutil.rmtree(self._own_certs, ignore_errors=True)  # the fork server may have removed it already
         if not self._kept:
             shutil.rmtree(self.folder)
 

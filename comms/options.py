@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from marl_sched.comms.protocol.keys import run_prefix
 from marl_sched.comms.protocol.rules import ClockKind, WorldRules
-from marl_sched.comms.transport.endpoints import is_loopback
+from marl_sched.comms.security.identity import WORLD, Identity
+from marl_sched.comms.transport.endpoints import is_encrypted, is_loopback
 from marl_sched.domain import Domain, Telemetry, get_domain
 from marl_sched.errors import InvalidOptionError, require
 
@@ -18,6 +19,10 @@ if TYPE_CHECKING:
     from marl_sched.simulation import TurnSimulator
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+INSECURE = (
+    "nothing is encrypted and nobody shows a certificate: whoever reaches {} can answer in an agent's name and hear "
+    "what all agents hear"
+)
 Sync = Literal["never", "commit"]
 Conflict = Literal["turns", "priority"]
 
@@ -36,8 +41,9 @@ class WorldOptions:
         view, view_options: what agents see.
         run: the run's name, part of every key.
         listen: endpoint, port 0 takes a free one.
-        insecure: whether to listen where other machines reach it, although nothing is encrypted and whoever connects
-            can read turns and answer in an agent's name.
+        certs: folder of certificates, which a `tls/` endpoint needs; see `marl-sched certs`.
+        insecure: whether to do without certificates on a `tcp/` endpoint, although whoever connects can then answer in
+            an agent's name and hear what all agents hear. A world on the loopback interface needs no such word.
         conflict: `turns`: free agents decide in turn and see each other's choices as their view allows; `priority`: all
             free agents choose at once, and a draw settles who gets what several chose, as in the Parallel API.
         clock: who owns time: `lockstep`, `paced` or `free`; see WorldRules.
@@ -68,6 +74,7 @@ class WorldOptions:
     view_options: Mapping[str, int | float] = field(default_factory=dict)
     run: str = "run"
     listen: str = DEFAULT_ENDPOINT
+    certs: str = ""
     insecure: bool = False
     conflict: Conflict = "turns"
     clock: ClockKind = "lockstep"
@@ -87,10 +94,10 @@ class WorldOptions:
     def __post_init__(self) -> None:
         """Refuse what cannot be run."""
         run_prefix(self.run)
-        if not self.insecure and not is_loopback(self.listen):
+        if not self.insecure and not is_loopback(self.listen) and not is_encrypted(self.listen):
             raise InvalidOptionError(
-                f"listen: {self.listen} is reached by other machines, and nothing is encrypted: whoever connects can "
-                "answer in an agent's name. Say --insecure (insecure: true) if nobody but yours can connect"
+                f"listen: {self.listen} is reached by other machines, and {INSECURE.format('it')}. Listen on tls/ with "
+                "--certs, or say --insecure (insecure: true) if nobody but yours can connect"
             )
         require("conflict", self.conflict, get_args(Conflict))
         require("clock", self.clock, get_args(ClockKind))
@@ -120,6 +127,10 @@ class WorldOptions:
             heartbeat=self.heartbeat,
             unheard=max(6 * self.heartbeat, 3 * self.lease),
         )
+
+    def identity(self) -> Identity | None:
+        """The world's certificate, None without `certs`; InvalidOptionError for a folder that lacks it."""
+        return Identity(Path(self.certs), WORLD) if self.certs else None
 
     def domain(self) -> Domain:
         """The domain, or UnknownNameError."""
@@ -183,6 +194,7 @@ class AgentOptions:
         agent: its index.
         policy: a scheduler's name or a checkpoint's path.
         run, connect: the world's `run` and endpoint.
+        certs: folder with the authority's certificate and this agent's, which a `tls/` endpoint needs.
         join_timeout: seconds to wait for the world, at the start and when it has been lost.
         lease: a link that is silent for that many seconds counts as dead.
     """
@@ -191,6 +203,7 @@ class AgentOptions:
     policy: str
     run: str = "run"
     connect: str = DEFAULT_ENDPOINT
+    certs: str = ""
     join_timeout: float = 60.0
     lease: float = 1.0
 
@@ -201,13 +214,24 @@ class AgentOptions:
         if self.agent < 0:
             raise InvalidOptionError(f"agent: expected an index >= 0, got {self.agent}")
 
+    def identity(self) -> Identity | None:
+        """The agent's certificate, None without `certs`; InvalidOptionError for a folder that lacks it."""
+        if not self.certs:
+            return None
+        found = sorted(path.stem for path in Path(self.certs).glob(f"*_{self.agent}.pem"))
+        if len(found) != 1:
+            what = f"one certificate of agent {self.agent}, such as crew_{self.agent}.pem"
+            raise InvalidOptionError(f"certs: {self.certs}: expected {what}, found {', '.join(found) or 'none'}")
+        return Identity(Path(self.certs), found[0])
+
 
 @dataclass(frozen=True, kw_only=True)
 class DeployOptions:
     """A world and all its agents on this machine.
 
     Attributes:
-        world: the plant's options.
+        world: the plant's options. It listens on a `tls/` endpoint, with certificates that are made for the run and
+            removed after it unless `certs` has some; on a `tcp/` endpoint only if it is `insecure`.
         policy: what decides for every agent...
         agent_policies: ...but for these, agent's name -> policy.
         agents: names of the agents that are started here, the others elsewhere; empty: all.
@@ -225,6 +249,11 @@ class DeployOptions:
 
     def __post_init__(self) -> None:
         """Refuse what cannot be run."""
+        if not is_encrypted(self.world.listen) and not self.world.insecure:
+            raise InvalidOptionError(
+                f"listen: on {self.world.listen} {INSECURE.format('it')}. Listen on tls/, or say --insecure "
+                "(insecure: true) if that is what you want"
+            )
         if self.restarts < 0:
             raise InvalidOptionError(f"restarts: expected an integer >= 0, got {self.restarts}")
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import os
 import time
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,23 @@ log = logging.getLogger(__name__)
 Progress = Callable[[str, int, int], None]  # (phase, simulated time, horizon)
 
 
+class Refusals:
+    """What the network refused, counted by the thread that reads of it."""
+
+    def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
+        self._warnings = ThrottledLog(log)
+
+    def count(self, kind: str, amount: int) -> None:
+        """`denied` messages, or `refused` connections."""
+        self.counts[kind] += amount
+        self._warnings.warn(kind, f"{self.counts[kind]} {kind} in all", time.monotonic())
+
+    def tell(self, line: str) -> None:
+        """Another warning of the network."""
+        self._warnings.warn("network", line, time.monotonic())
+
+
 class World:
     """One life of a run's world, from the first hello to the report.
 
@@ -50,6 +68,7 @@ class World:
         plant: Plant | None = None,
         commits: CommitLog | None = None,
         progress: Progress | None = None,
+        refused: Refusals | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """`plant`: the domain's simulator unless given, at its start or, with a log, where that ends."""
@@ -78,6 +97,7 @@ class World:
         self._progress = progress or (lambda phase, tick, horizon: None)
         self._told: tuple[str, int] = ("", -1)
         self._tick = 0
+        self._refused = refused or Refusals()
 
     def run(self) -> dict[str, Any]:
         """Gather the agents, play the episode, say goodbye; the report, whatever the end.
@@ -104,7 +124,7 @@ class World:
         for key in (self._keys.hello("*"), self._keys.decision("*")):
             self.transport.subscribe(key)
         self.transport.watch(self._keys.alive("*", "*"))
-        for key in (keys.FRAME, keys.SNAPSHOT):
+        for key in (keys.FRAME, keys.snapshot("*")):
             self.transport.serve(key)
         self.transport.announce(keys.WORLD_ALIVE)
         self._tell_progress()
@@ -179,6 +199,7 @@ class World:
 
     def _report(self, ending: ev.End, seconds: float) -> dict[str, Any]:
         self.metrics.counts.update(self.transport.dropped)
+        self.metrics.counts.update(self._refused.counts)
         report = build_report(
             self.options,
             ending=ending,
@@ -200,6 +221,7 @@ def serve(options: WorldOptions, progress: Progress | None = None) -> dict[str, 
     DeploymentError if the endpoint is in use or an agent is missing at the start, InvalidFileError for the log of
     another run, and the typed errors of a problem that does not exist.
     """
+    from marl_sched.comms.security.refusals import counted_refusals
     from marl_sched.comms.transport.endpoints import settle_port
     from marl_sched.comms.transport.zenoh_session import hub
 
@@ -207,13 +229,22 @@ def serve(options: WorldOptions, progress: Progress | None = None) -> dict[str, 
     if options.log:
         header = Header(schema=SCHEMA, run=options.run, problem=options.problem())
         commits = FileLog(Path(options.log), header, options.sync)
-    transport = hub(options.run, settle_port(options.listen), options.domain().agent_prefix, options.lease)
-    try:
-        world = World(options, transport, commits=commits, progress=progress)
-        with interruptible(transport):
-            return world.run()
-    finally:
-        transport.close()
+    identity, plant, refused = options.identity(), options.plant(), Refusals()
+    with counted_refusals(refused.count, refused.tell):
+        transport = hub(
+            options.run,
+            settle_port(options.listen),
+            options.domain().agent_prefix,
+            options.lease,
+            identity=identity,
+            channels=plant.channels,
+        )
+        try:
+            world = World(options, transport, plant=plant, commits=commits, progress=progress, refused=refused)
+            with interruptible(transport):
+                return world.run()
+        finally:
+            transport.close()
 
 
 def exit_code_of(report: dict[str, Any]) -> int:

@@ -13,9 +13,11 @@ MAX_EVENTS = 10_000
 # `stale`: decisions that answer no open turn: late, repeated, or of an incarnation that was given up. `contradicted`:
 # a second decision for a turn with another action. `other_epoch`: said to another run or life of the world.
 # `unanswered`: queries beyond what the world answers in a second. `replaced`, `no_place`, `too_long`: dropped unseen.
+# `denied`: messages, subscriptions and tokens that the access rules let neither in nor out. `refused`: connections
+# without a valid certificate.
 COUNTS = (
     "conflicts", "illegal", "missed_deadlines", "tick_overruns", "stale", "contradicted", "fenced", "unparsed",
-    "other_epoch", "unanswered", "replaced", "no_place", "too_long",
+    "other_epoch", "unanswered", "replaced", "no_place", "too_long", "denied", "refused",
 )  # fmt: skip
 
 

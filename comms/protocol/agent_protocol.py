@@ -219,7 +219,7 @@ class AgentProtocol:
 
     def _ask_snapshot(self, now: float, out: list[ev.Effect]) -> None:
         request = wire.SnapshotRequest(run=self._run, epoch=self._epoch, agent=self._agent)
-        self._ask(keys.SNAPSHOT, request, now, out)
+        self._ask(keys.snapshot(self._agent), request, now, out)
 
     def _caught_up(self, snapshot: wire.Snapshot, now: float, out: list[ev.Effect]) -> None:
         self.counts["snapshots"] += 1

@@ -3,9 +3,10 @@
 | Key | From, to | Carries |
 |---|---|---|
 | `world/frame` | query to the world | Frame |
-| `world/snapshot` | query to the world | Snapshot |
+| `world/snapshot/<id>` | query to the world by that agent | Snapshot |
 | `world/clock` | world to all | Clock |
 | `world/alive` | liveliness token of the world | |
+| `world/observed` | world to observers | Observed |
 | `<channel>` | world to those who may hear it | News |
 | `crew/<id>/turn` | world to that agent | Turn, Welcome, Fenced, Refused |
 | `crew/<id>/hello` | agent to world | Hello, Beat, Goodbye |
@@ -19,7 +20,7 @@ import re
 
 from marl_sched.errors import InvalidMessageError, InvalidOptionError
 
-CLOCK, FRAME, SNAPSHOT, WORLD_ALIVE = "world/clock", "world/frame", "world/snapshot", "world/alive"
+CLOCK, FRAME, WORLD_ALIVE, OBSERVED = "world/clock", "world/frame", "world/alive", "world/observed"
 INCARNATION = r"[0-9a-zA-Z-]{1,48}"
 MAX_KEY = 256  # characters of a key that is looked at
 
@@ -29,6 +30,11 @@ def run_prefix(run: str) -> str:
     if not re.fullmatch(r"[A-Za-z0-9_.-]{1,64}", run):
         raise InvalidOptionError(f"run: expected 1 to 64 letters, digits, '.', '_' or '-', got {run!r}")
     return f"marl_sched/{run}/"
+
+
+def snapshot(agent: int | str) -> str:
+    """By which an agent asks the world for the state of its channels; `*` for all."""
+    return f"world/snapshot/{agent}"
 
 
 def kind_of(key: str) -> str:

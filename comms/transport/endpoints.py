@@ -30,6 +30,12 @@ def is_loopback(endpoint: str) -> bool:
         return False
 
 
+def is_encrypted(endpoint: str) -> bool:
+    """Whether both sides show certificates."""
+    check_endpoint("endpoint", endpoint)
+    return endpoint.startswith("tls/")
+
+
 def settle_port(endpoint: str) -> str:
     """The endpoint with a free port in place of port 0; DeploymentError if its port is in use or not ours to use."""
     host, port = check_endpoint("listen", endpoint)

@@ -5,8 +5,9 @@ and do nothing but put an event into the inbox. Scouting and shared memory are o
 blocking congestion control, so that no reader, however slow or frozen, can hold up a sender; the protocol sends
 again what is lost.
 
-The hub's access rules let agents' keys in and nothing else: whoever connects can neither say what the world says nor
-answer in its place, and agents' decisions are relayed to nobody.
+The hub's access rules (`marl_sched.comms.security.access`) let agents' keys in and nothing else: whoever connects can
+neither say what the world says nor answer in its place, and agents' decisions are relayed to nobody. On a `tls/`
+endpoint both sides show certificates, and the rules tell agents apart.
 """
 
 from __future__ import annotations
@@ -18,24 +19,27 @@ import socket
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import zenoh
 
 from marl_sched.comms.protocol.events import Answered, Event, Queried, Received, TokenAppeared, TokenVanished
 from marl_sched.comms.protocol.keys import MAX_KEY, run_prefix
+from marl_sched.comms.security.access import named_rules, open_rules
+from marl_sched.comms.security.identity import Identity
 from marl_sched.comms.transport.base import MAX_PAYLOAD
-from marl_sched.comms.transport.endpoints import check_endpoint
+from marl_sched.comms.transport.endpoints import check_endpoint, is_encrypted
 from marl_sched.comms.transport.inbox import Inbox
-from marl_sched.errors import DeploymentError
+from marl_sched.errors import DeploymentError, InvalidOptionError
 
 DEFAULT_LEASE = 1.0  # seconds of silence after which a link counts as dead
 QUEUE = 16  # batches that may wait on a link, the most that Zenoh takes
 DROP_AFTER_US = 2000  # for which a full link may hold up a message before it is dropped
 CONNECT_SLICE = 1.0  # seconds for which an attempt to connect may keep a process from hearing signals
-MAX_QUERIES = 64  # that wait for an answer; more are dropped
+MAX_QUERIES, MAX_ALIKE = 256, 4  # that wait for an answer, in all and by one key; more are dropped
 QUERY_TIMEOUT = 10.0
+ACCEPT_MS = 2000  # for which a connection may be half open
 
 
 class ZenohTransport:
@@ -107,7 +111,8 @@ class ZenohTransport:
         def note(query: zenoh.Query) -> None:
             payload = query.payload.to_bytes() if query.payload is not None else b""
             with self._queries_lock:
-                if len(self._queries) >= MAX_QUERIES or len(payload) > MAX_PAYLOAD:
+                alike = sum(waits.key_expr == query.key_expr for waits in self._queries.values())
+                if len(self._queries) >= MAX_QUERIES or alike >= MAX_ALIKE or len(payload) > MAX_PAYLOAD:
                     self.dropped["no_place"] += 1
                     query.drop()
                     return
@@ -148,13 +153,24 @@ class ZenohTransport:
         return str(key).removeprefix(self._prefix)
 
 
-def hub(run: str, endpoint: str, prefix: str, lease: float = DEFAULT_LEASE) -> ZenohTransport:
-    """The world's session, listening on an endpoint such as `tcp/127.0.0.1:7447`.
+def hub(
+    run: str,
+    endpoint: str,
+    prefix: str,
+    lease: float = DEFAULT_LEASE,
+    *,
+    identity: Identity | None = None,
+    channels: Sequence[Sequence[str]] = (),
+) -> ZenohTransport:
+    """The world's session, listening on an endpoint such as `tls/127.0.0.1:7447`.
 
-    `prefix` is that of agents' names. DeploymentError if the endpoint is in use.
+    `prefix` is that of agents' names. With `identity`, the world's certificate, agents must show theirs, and agent i
+    hears `channels[i]`. DeploymentError if the endpoint is in use, InvalidOptionError for `tls/` without a certificate
+    or another protocol with one.
     """
     check_endpoint("listen", endpoint)
-    config = _config(lease, mode="peer", listen={"endpoints": [endpoint]}, access_control=access_rules(run, prefix))
+    rules = open_rules(run, prefix) if identity is None else named_rules(run, prefix, channels)
+    config = _config(endpoint, lease, identity, mode="peer", listen={"endpoints": [endpoint]}, access_control=rules)
 
     def connect() -> zenoh.Session:
         try:
@@ -167,14 +183,19 @@ def hub(run: str, endpoint: str, prefix: str, lease: float = DEFAULT_LEASE) -> Z
     return ZenohTransport(run, connect)
 
 
-def spoke(run: str, endpoint: str, timeout: float, lease: float = DEFAULT_LEASE) -> ZenohTransport:
-    """An agent's session, connected to the world's endpoint; waits up to `timeout` seconds for it."""
+def spoke(
+    run: str, endpoint: str, timeout: float, lease: float = DEFAULT_LEASE, *, identity: Identity | None = None
+) -> ZenohTransport:
+    """An agent's session, connected to the world's endpoint; waits up to `timeout` seconds for it.
+
+    `identity` is the agent's certificate, which a `tls/` endpoint asks for; InvalidOptionError as for `hub`.
+    """
     check_endpoint("connect", endpoint)
 
     def connect() -> zenoh.Session:
         end = time.monotonic() + timeout
         while True:
-            session = _connect(endpoint, min(CONNECT_SLICE, end - time.monotonic()), lease)
+            session = _connect(endpoint, min(CONNECT_SLICE, end - time.monotonic()), lease, identity)
             if not isinstance(session, zenoh.ZError):
                 return session
             if time.monotonic() >= end:
@@ -184,48 +205,13 @@ def spoke(run: str, endpoint: str, timeout: float, lease: float = DEFAULT_LEASE)
     return ZenohTransport(run, connect)
 
 
-def access_rules(run: str, prefix: str) -> dict[str, Any]:
-    """The hub's access control: what whoever connects may say, and what the hub tells them.
-
-    Deny is the default. Agents' hellos, decisions and tokens come in, and questions to the world; what the world says
-    goes out, but not what other agents said.
-    """
-    root = run_prefix(run)
-    from_agents = [f"{root}{prefix}/*/{leaf}" for leaf in ("hello", "decision")]
-    declarations = ["declare_subscriber", "declare_liveliness_subscriber", "liveliness_query"]
-    rules = {
-        "said": _rule("allow", "ingress", ["put"], from_agents),
-        "tokens": _rule("allow", "ingress", ["liveliness_token"], [f"{root}{prefix}/*/alive/*"]),
-        "asked": _rule("allow", "ingress", ["query"], [f"{root}world/frame", f"{root}world/snapshot"]),
-        "heard": _rule("allow", "ingress", declarations, ["**"]),
-        "told": _rule(
-            "allow",
-            "egress",
-            ["put", "reply", "liveliness_token", "declare_queryable", "declare_subscriber", "query"],
-            [f"{root}**"],
-        ),
-        "private": _rule("deny", "egress", ["put"], from_agents),
-    }
-    return {
-        "enabled": True,
-        "default_permission": "deny",
-        "rules": [{"id": name, **rule} for name, rule in rules.items()],
-        "subjects": [{"id": "anybody"}],
-        "policies": [{"rules": list(rules), "subjects": ["anybody"]}],
-    }
-
-
-def _rule(permission: str, flow: str, messages: list[str], key_exprs: list[str]) -> dict[str, Any]:
-    return {"permission": permission, "flows": [flow], "messages": messages, "key_exprs": key_exprs}
-
-
-def _connect(endpoint: str, seconds: float, lease: float) -> zenoh.Session | zenoh.ZError:
+def _connect(endpoint: str, seconds: float, lease: float, identity: Identity | None) -> zenoh.Session | zenoh.ZError:
     """A session connected to an endpoint, or why there was none in time. Signals wait for it to return."""
     retry = {"period_init_ms": 100, "period_max_ms": 400, "period_increase_factor": 2.0}
     timeout_ms = max(int(seconds * 1000), 1)
     connect = {"endpoints": [endpoint], "timeout_ms": timeout_ms, "exit_on_failure": True, "retry": retry}
     try:
-        return zenoh.open(_config(lease, mode="client", connect=connect))
+        return zenoh.open(_config(endpoint, lease, identity, mode="client", connect=connect))
     except zenoh.ZError as error:
         return error
 
@@ -244,14 +230,30 @@ def _plain(error: zenoh.ZError) -> str:
     return re.sub(r" at /\S+:\d+\.?", "", str(error)).strip()
 
 
-def _config(lease: float, **sections: Any) -> zenoh.Config:
+def _config(endpoint: str, lease: float, identity: Identity | None, **sections: Any) -> zenoh.Config:
     queue = {"size": {"data": QUEUE}, "congestion_control": {"drop": {"wait_before_drop": DROP_AFTER_US}}}
+    link: dict[str, Any] = {
+        "tx": {"lease": int(lease * 1000), "queue": queue},
+        "rx": {"max_message_size": 2 * MAX_PAYLOAD},
+        "protocols": [endpoint.partition("/")[0]],
+    }
+    if is_encrypted(endpoint) != (identity is not None):
+        raise InvalidOptionError(f"{endpoint}: {'needs certificates' if identity is None else 'takes no certificates'}")
+    if identity is not None:
+        link["tls"] = _certificates(identity, "listen" if "listen" in sections else "connect")
     whole: Mapping[str, Any] = {
         **sections,
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}, "delay": 0},
-        "transport": {
-            "shared_memory": {"enabled": False},
-            "link": {"tx": {"lease": int(lease * 1000), "queue": queue}, "rx": {"max_message_size": 2 * MAX_PAYLOAD}},
-        },
+        "transport": {"shared_memory": {"enabled": False}, "unicast": {"accept_timeout": ACCEPT_MS}, "link": link},
     }
     return zenoh.Config.from_json5(json.dumps(whole))
+
+
+def _certificates(identity: Identity, way: str) -> dict[str, Any]:
+    return {
+        "root_ca_certificate": str(identity.authority),
+        "enable_mtls": True,
+        "verify_name_on_connect": True,
+        f"{way}_certificate": str(identity.certificate),
+        f"{way}_private_key": str(identity.key),
+    }

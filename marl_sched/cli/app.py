@@ -54,6 +54,7 @@ EXTRAS = {
     "omegaconf": "train",
     "tensorboard": "train",
     "zenoh": "deploy",
+    "cryptography": "deploy",
     "ortools": "solvers",
     "matplotlib": "plots",
 }

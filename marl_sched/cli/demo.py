@@ -105,7 +105,7 @@ def _deploy(policy: str, problem: Problem, path: Path) -> dict[str, Any]:
         objective=problem.objective,
         view=problem.view.kind,
         view_options=asdict(problem.view),
-        listen="tcp/127.0.0.1:0",
+        listen="tls/127.0.0.1:0",
         report=str(path),
     )
     with progress_bar() as tell:

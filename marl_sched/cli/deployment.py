@@ -1,4 +1,4 @@
-"""`marl-sched world`, `agent` and `deploy`: the plant, one agent, or all of them as processes of this machine."""
+"""`marl-sched world`, `agent`, `deploy`, `certs` and `replay`: a plant and its agents as processes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,12 @@ if TYPE_CHECKING:
 _PROBLEM = f"--env {options.DEFAULT_ENV} --scale small --seed 1 --view local --reach 1 --comm 1"
 
 Policy = Annotated[str, typer.Option("--policy", help="A rule's or shipped policy's name, or a checkpoint's path.")]
+Progress = Callable[[str, int, int], None]  # (phase, simulated time, horizon)
 Json = options.JsonFile
+Certs = Annotated[
+    Path | None,
+    typer.Option("--certs", metavar="DIR", help="Certificates, as `marl-sched certs` makes them, for a tls/ endpoint."),
+]
 Log = Annotated[
     Path | None,
     typer.Option("--log", metavar="FILE", help="The run's log of decisions; a world started with it goes on from it."),
@@ -30,9 +35,12 @@ Log = Annotated[
 
 def add_to(app: typer.Typer) -> None:
     """Register this file's commands."""
-    example = f"Example: marl-sched world {_PROBLEM} --listen tcp/127.0.0.1:7447 --json run.json"
+    example = f"Example: marl-sched world {_PROBLEM} --certs certs --listen tls/0.0.0.0:7447 --json run.json"
     app.command(epilog=example, context_settings=DOMAIN_OPTIONS)(takes(Plant)(world))
-    app.command(epilog="Example: marl-sched agent --agent 3 --policy condition --connect tcp/127.0.0.1:7447")(agent)
+    app.command(epilog="Example: marl-sched agent --agent 3 --policy condition --certs certs --connect tls/plant:7447")(
+        agent
+    )
+    app.command(epilog="Example: marl-sched certs --out certs --agents crew_0..crew_6 --host plant")(certs)
     example = f"Example: marl-sched deploy {_PROBLEM} --policy random --agent-policy crew_3=condition --json run.json"
     app.command(epilog=example, context_settings=DOMAIN_OPTIONS)(takes(Plant)(deploy))
     app.command(epilog="Example: marl-sched replay out/run/run.jsonl --picture run.png")(replay)
@@ -52,8 +60,10 @@ class Plant:
     objective: options.Objective = None
     view: options.View = "full"
     run: Annotated[str, typer.Option("--run", help="The run's name, by which its processes find each other.")] = "run"
+    certs: Certs = None
     insecure: Annotated[
-        bool, typer.Option("--insecure", help="Listen where other machines reach it; nothing is encrypted.")
+        bool,
+        typer.Option("--insecure", help="No certificates: whoever connects can answer in an agent's name and listen."),
     ] = False
     conflict: Annotated[
         str,
@@ -118,6 +128,7 @@ class Plant:
             view_options=asdict(problem.view),
             run=self.run,
             listen=listen,
+            certs=str(self.certs or ""),
             insecure=self.insecure,
             conflict=self.conflict,  # type: ignore[arg-type]  # WorldOptions refuses other words
             clock=self.clock,  # type: ignore[arg-type]  # WorldOptions refuses other words
@@ -139,16 +150,17 @@ def world(
     plant: Plant,
     *,
     listen: Annotated[
-        str, typer.Option("--listen", metavar="ENDPOINT", help="Where to listen for agents.")
-    ] = "tcp/127.0.0.1:7447",
+        str, typer.Option("--listen", metavar="ENDPOINT", help="Where to listen (default: 127.0.0.1:7447).")
+    ] = "",
     log: Log = None,
     json: Json = None,
 ) -> None:
     """Be the plant of a run: own the simulator, tell what happens, apply the agents' decisions."""
     from marl_sched.comms.world import serve
 
+    chosen = plant.world_options(listen or _endpoint(plant.certs is not None, 7447), json, log)
     with progress_bar() as tell:
-        report = serve(plant.world_options(listen, json, log), tell)
+        report = serve(chosen, _warning_of_insecurity(chosen, tell))
     finish(report)
 
 
@@ -157,8 +169,9 @@ def agent(
     policy: Policy,
     run: Annotated[str, typer.Option("--run", help="The world's run.")] = "run",
     connect: Annotated[
-        str, typer.Option("--connect", metavar="ENDPOINT", help="Where the world listens.")
-    ] = "tcp/127.0.0.1:7447",
+        str, typer.Option("--connect", metavar="ENDPOINT", help="Where the world listens (default: 127.0.0.1:7447).")
+    ] = "",
+    certs: Certs = None,
     join_timeout: Annotated[float, typer.Option("--join-timeout", help="Seconds to wait for the world.")] = 60.0,
     lease: Annotated[
         float, typer.Option("--lease", help="Seconds of silence after which a link counts as dead.")
@@ -168,7 +181,17 @@ def agent(
     from marl_sched.comms.agent import run as be_agent
     from marl_sched.comms.options import AgentOptions
 
-    be_agent(AgentOptions(agent=agent, policy=policy, run=run, connect=connect, join_timeout=join_timeout, lease=lease))
+    be_agent(
+        AgentOptions(
+            agent=agent,
+            policy=policy,
+            run=run,
+            connect=connect or _endpoint(certs is not None, 7447),
+            certs=str(certs or ""),
+            join_timeout=join_timeout,
+            lease=lease,
+        )
+    )
 
 
 def deploy(
@@ -180,8 +203,11 @@ def deploy(
         typer.Option("--agent-policy", metavar="AGENT=POLICY", help="Another policy for one agent; may be repeated."),
     ] = None,
     listen: Annotated[
-        str, typer.Option("--listen", metavar="ENDPOINT", help="Where the world listens; port 0: a free one.")
-    ] = "tcp/127.0.0.1:0",
+        str,
+        typer.Option(
+            "--listen", metavar="ENDPOINT", help="Where the world listens (default: a free port of loopback, with TLS)."
+        ),
+    ] = "",
     agents: Annotated[
         str, typer.Option("--agents", metavar="A,B", help="Agents to start here, the others elsewhere (default: all).")
     ] = "",
@@ -204,7 +230,7 @@ def deploy(
     by_agent = _by_agent(agent_policy or [])
     problem = plant.problem()
     chosen = DeployOptions(
-        world=plant.world_options(listen, json),
+        world=plant.world_options(listen or _endpoint(not plant.insecure, 0), json),
         policy=policy,
         agent_policies=by_agent,
         agents=tuple(name for name in agents.split(",") if name),
@@ -214,7 +240,7 @@ def deploy(
     for name in dict.fromkeys([policy, *by_agent.values()]):
         options.tell_of_training(name, card_of(name, problem.domain), problem.view, problem.objective)
     with progress_bar() as tell:
-        report = launch(chosen, tell)
+        report = launch(chosen, _warning_of_insecurity(chosen.world, tell))
     finish(report)
 
 
@@ -237,6 +263,42 @@ def replay(
     if json is not None:
         write_json(json, report)
     print_report(report)
+
+
+def certs(
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Where to write them.")],
+    agents: Annotated[str, typer.Option("--agents", metavar="A,B,C..D", help="Agents' names, such as crew_0..crew_6.")],
+    host: Annotated[
+        list[str] | None,
+        typer.Option("--host", help="An address or name by which agents reach the world; may be repeated."),
+    ] = None,
+    days: Annotated[int, typer.Option("--days", help="For which they are valid.")] = 365,
+) -> None:
+    """Make an authority and certificates for a world, observers and agents; with DIR's authority if it has one."""
+    from marl_sched.comms.security.certificates import agent_names, make_certificates
+
+    made = make_certificates(out, agent_names(agents), hosts=host or [], days=days)
+    typer.echo(f"{out}: {', '.join(made) or 'nothing new'}")
+    typer.echo("Take ca.pem and its own .pem and .key to each host; ca.key stays where it is, and nowhere else.")
+
+
+def _endpoint(encrypted: bool, port: int) -> str:
+    return f"{'tls' if encrypted else 'tcp'}/127.0.0.1:{port}"
+
+
+def _warning_of_insecurity(world: WorldOptions, tell: Progress) -> Progress:
+    """The same, which first says what is given up without certificates, when the world is there."""
+    from marl_sched.comms.options import INSECURE
+    from marl_sched.comms.transport.endpoints import is_encrypted
+
+    pending = [] if is_encrypted(world.listen) else [f"insecure: {INSECURE.format(world.listen)}"]
+
+    def tell_once(phase: str, tick: int, horizon: int) -> None:
+        while pending and phase != "starting":
+            typer.echo(pending.pop(), err=True)
+        tell(phase, tick, horizon)
+
+    return tell_once
 
 
 @contextmanager

@@ -212,7 +212,7 @@ def test_a_port_in_use_is_refused(run, tmp_path):
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        for command in (("world",), ("deploy", "--policy", "condition")):
+        for command in (("world",), ("deploy", "--policy", "condition", "--insecure")):
             ended = run(*command, "--hours", 5, "--listen", f"tcp/127.0.0.1:{port}", "--json", tmp_path / "r.json")
             refused(ended, port)
     assert list(tmp_path.iterdir()) == []

@@ -85,7 +85,7 @@ def test_agent_finds_the_world_catches_up_announces_itself_and_says_hello():
         ev.Subscribe("bot/1/turn"),
         ev.Subscribe(CHANNEL),
         ev.Subscribe(keys.CLOCK),
-        ev.Ask(2, keys.SNAPSHOT, wire.SnapshotRequest(**US, agent=1)),
+        ev.Ask(2, keys.snapshot(1), wire.SnapshotRequest(**US, agent=1)),
     ]
     assert agent.answer(0.5, snapshot()) == [
         ev.Announce("bot/1/alive/me-1"),
@@ -157,7 +157,7 @@ def test_older_state_and_state_of_another_channel_are_not_believed():
 def test_sequence_that_jumps_is_asked_about_instead_of_believed():
     agent = AgentDriver()
     (ask,) = of(agent.hear(1.0, CHANNEL, news(2**62 - 1)), ev.Ask)
-    assert ask.key == keys.SNAPSHOT
+    assert ask.key == keys.snapshot(1)
     assert of(agent.hear(1.5, CHANNEL, news(2**62 - 1)), ev.Ask) == []
     agent.answer(1.6, snapshot(1))
     assert of(agent.turn(1.7, needs=2), ev.Choose) == []

@@ -84,7 +84,7 @@ def test_snapshot_holds_no_more_than_the_view_allows(make_run):
     run.play()
     world = run.world
     request = wire.encode(wire.SnapshotRequest(run="run", epoch=world.epoch, agent=0))
-    (reply,) = world.protocol.handle(ev.Queried(keys.SNAPSHOT, request, 1), world._clock())
+    (reply,) = world.protocol.handle(ev.Queried(keys.snapshot(0), request, 1), world._clock())
     said = {news.channel for news in reply.message.channels}
     assert said == run.agents[0].protocol.subscriptions - {"crew/0/turn", "world/clock"}
 

@@ -30,7 +30,7 @@ def world(**changes) -> WorldOptions:
     """Seven crews under a run's name of their own; nobody is late on a busy machine."""
     run = f"test-{uuid.uuid4().hex[:12]}"
     defaults = {
-        "env": "airme", "seed": 0, "horizon": 48, "run": run, "listen": "tcp/127.0.0.1:0", "deadline": 30.0,
+        "env": "airme", "seed": 0, "horizon": 48, "run": run, "listen": "tls/127.0.0.1:0", "deadline": 30.0,
         "ready_timeout": 200.0, "standstill": 200.0, "grace": 60.0, **LOCAL,
     }  # fmt: skip
     return WorldOptions(**{**defaults, **changes})

@@ -36,7 +36,7 @@ while time.monotonic() < end:
         session.put(root + key, json.dumps(forged).encode() + bytes(200))
         count += 1
     token = session.liveliness().declare_token(root + f"crew/3/alive/forged-{count}")
-    list(session.get(root + "world/snapshot", payload=b"garbage", timeout=0.01)) if count % 70 == 0 else None
+    list(session.get(root + "world/snapshot/3", payload=b"garbage", timeout=0.01)) if count % 70 == 0 else None
     token.undeclare()
 print(count, flush=True)
 session.close()
@@ -46,7 +46,7 @@ session.close()
 def world() -> WorldOptions:
     run = f"test-{uuid.uuid4().hex[:12]}"
     return WorldOptions(
-        env="airme", seed=0, horizon=4000, run=run, listen="tcp/127.0.0.1:0", deadline=30.0, ready_timeout=200.0,
+        env="airme", seed=0, horizon=4000, run=run, listen="tcp/127.0.0.1:0", insecure=True, deadline=30.0, ready_timeout=200.0,
         standstill=200.0, grace=60.0, **LOCAL,
     )  # fmt: skip
 

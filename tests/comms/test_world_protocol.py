@@ -356,7 +356,7 @@ def test_frame_and_snapshot_say_run_epoch_and_no_more_than_the_agent_may_hear():
     (frame,) = of(world.at(1.0, ev.Queried(keys.FRAME, b"", 1)), ev.Reply)
     assert frame.message == wire.Frame(run=RUN, epoch=EPOCH, env="toy", agents=2, heartbeat=0.5, problem=b"f")
     request = wire.encode(wire.SnapshotRequest(**US, agent=1))
-    (reply,) = of(world.at(1.0, ev.Queried(keys.SNAPSHOT, request, 2)), ev.Reply)
+    (reply,) = of(world.at(1.0, ev.Queried(keys.snapshot(1), request, 2)), ev.Reply)
     assert [news.channel for news in reply.message.channels] == ["state/1"]
 
 
