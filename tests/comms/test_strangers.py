@@ -46,8 +46,8 @@ session.close()
 def world() -> WorldOptions:
     run = f"test-{uuid.uuid4().hex[:12]}"
     return WorldOptions(
-        env="airme", seed=0, horizon=4000, run=run, listen="tcp/127.0.0.1:0", insecure=True, deadline=30.0, ready_timeout=200.0,
-        standstill=200.0, grace=60.0, **LOCAL,
+        env="airme", seed=0, horizon=4000, run=run, listen="tcp/127.0.0.1:0", insecure=True, deadline=30.0,
+        ready_timeout=200.0, standstill=200.0, grace=60.0, **LOCAL,
     )  # fmt: skip
 
 
