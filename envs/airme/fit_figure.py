@@ -50,9 +50,7 @@ def _survival(axes: Any, part: PartFit, usage: np.ndarray) -> None:
         with warnings.catch_warnings():  # where nobody or everybody has failed there is no interval: drawn from 0 to 1
             warnings.filterwarnings("ignore", "The confidence interval is undefined", RuntimeWarning)
             low, high = (end.probabilities for end in recorded.confidence_interval(method="log-log"))
-        ends = [
-            np.concatenate([[1.0], np.nan_to_num(end.probabilities, nan=value)]) for end, value in ((low, 0), (high, 1))
-        ]
+        ends = [np.concatenate([[1.0], np.where(np.isnan(end), edge, end)]) for end, edge in ((low, 0.0), (high, 1.0))]
         axes.fill_between(x, *ends, step="post", color=_BAND, alpha=0.6, lw=0, label="95 % of the recorded")
     fitted = np.exp(-((usage / part.scale) ** part.shape))
     axes.plot(usage, fitted, color=_FITTED, label=f"Weibull, scale {part.scale:.4g}, shape {part.shape:.3g}")
