@@ -111,7 +111,8 @@ class SimulatedPlant:
         """See Plant.summary: simulated time, objectives, and their series."""
         objectives = {name: float(values[0]) for name, values in self.simulator.objectives().items()}
         series = self.telemetry.series(self.simulator)
-        return {"time": int(self.simulator.time[0]), "objectives": objectives, **series}
+        figures = {name: values[0].tolist() for name, values in self.simulator.agent_figures().items()}
+        return {"time": int(self.simulator.time[0]), "objectives": objectives, "agent_figures": figures, **series}
 
 
 class SimultaneousPlant(SimulatedPlant):

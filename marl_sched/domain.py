@@ -243,6 +243,10 @@ class Domain:
         """`crew_3` for agent 3 of a domain whose agents are crews."""
         return f"{self.agent_prefix}_{agent}"
 
+    def agent_names(self, instance: Any, count: int) -> list[str]:
+        """What an instance's agents are called: by its own `agent_names` where it has them, else `agent_name`."""
+        return list(getattr(instance, "agent_names", ())) or [self.agent_name(i) for i in range(count)]
+
     def instances(self, scale: str, count: int, seed: int, split: Split = "test") -> list[Any]:
         """`count` instances of a scale; instance i depends on (seed, split, i) alone (marl_sched.noise).
 

@@ -132,6 +132,10 @@ class ScoredSimulator(TurnSimulator):
         """As the domain's simulator."""
         return self.inner.per_round()
 
+    def agent_figures(self) -> dict[str, np.ndarray]:
+        """As the domain's simulator."""
+        return self.inner.agent_figures()
+
     def snapshot(self, env_index: int) -> dict[str, np.ndarray]:
         """The domain's state, and what was paid."""
         return {

@@ -160,6 +160,14 @@ class TurnSimulator(ABC):
         """
         return {}
 
+    def agent_figures(self) -> dict[str, np.ndarray]:
+        """What every agent did in the running or finished episodes: name -> float64 (B, max_agents).
+
+        NaN for slots without an agent. `utilisation` is the share of time at work, `idle` the rest; the other figures
+        are the domain's own. Empty for domains that count none.
+        """
+        return {}
+
     @property
     def length(self) -> np.ndarray:
         """Int64 (B,), the length of each env's episode in `unit` if nothing ends it early; the horizon, mostly."""

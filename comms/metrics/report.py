@@ -49,6 +49,8 @@ def build_report(
     domain, telemetry = options.domain(), options.telemetry()
     objective = options.chosen_objective()
     listed = list(commits)
+    summary = dict(summary)
+    figures: dict[str, list[float]] = summary.pop("agent_figures")
     shares = [commit.share for commit in listed]
     return {
         "schema": SCHEMA,
@@ -75,6 +77,7 @@ def build_report(
                 "losses": slot.losses,
                 "waited_s": round(slot.waited_in_all, 4),
                 "counts": slot.counts,
+                "figures": {name: values[i] for name, values in figures.items()},
             }
             for i, slot in enumerate(slots)
         ],

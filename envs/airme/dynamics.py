@@ -77,6 +77,8 @@ FULL, SKIP, SINGLE = 0, 1, 2
 SCHEMES = ("full", "skip", "single")
 # What a plane does in an hour, for timelines.
 GROUNDED, FLYING, BROKEN, REPAIR = 0, 1, 2, 3
+# What is counted of a crew: hours in repair, repairs begun, hours free while a broken plane stood unattended.
+REPAIRED, BEGUN, MISSED = 0, 1, 2
 
 
 class State(NamedTuple):
@@ -87,6 +89,8 @@ class State(NamedTuple):
     crews: np.ndarray  # CREW (B, C)
     series: np.ndarray  # float64 (B, T, 3), objectives of each hour
     timeline: np.ndarray  # uint8 (B, T, P + 1), what each plane did, or (0, 0, 0): not recorded
+    jobs: np.ndarray  # int32 (B, T, C), the plane that each crew repaired, 0: none, or (0, 0, 0), as `timeline`
+    work: np.ndarray  # int64 (B, C, 3), what each crew did so far: REPAIRED, BEGUN, MISSED, or (0, 0, 0): not counted
     past: np.ndarray  # PLANE (B, H + 1, P + 1), planes at the start of hour t in slot t mod (H + 1), or (B, 0, P + 1)
     private_memory: np.ndarray  # PLANE (B, C, P + 1), statuses that a crew learnt by itself, or (0, 0, 0)
     private_memory_at: np.ndarray  # int64 (B, C, P + 1), hour of that status, -1: never, or (0, 0, 0)
@@ -188,6 +192,21 @@ def release(plane: Record, crews: np.ndarray) -> None:
         plane.mission_done = 0
 
 
+@kernel(inline="always")
+def count_missed(work: np.ndarray, planes: np.ndarray, crews: np.ndarray, row: Record) -> None:
+    """Count an hour for every crew that stays free while a broken plane stands unattended."""
+    free = 0
+    for crew in range(row.n_crews):
+        free += crews[crew].plane == 0
+    if free == 0:
+        return
+    for slot in range(1, row.n_planes + 1):
+        if planes[slot].broken and planes[slot].crew < 0:
+            for crew in range(row.n_crews):
+                work[crew, MISSED] += crews[crew].plane == 0
+            return
+
+
 @kernel
 def hour(state: State, rules: Rules, b: int) -> tuple[float, float, int, int]:
     """One hour of row b; returns (income, repair cost, planes available, planes broken).
@@ -205,6 +224,8 @@ def hour(state: State, rules: Rules, b: int) -> tuple[float, float, int, int]:
             crews[crew].plane = action
             crews[crew].job_hours = planes[action].job_hours
             crews[crew].job_done = 0
+            state.work[b, crew, BEGUN] += 1
+    count_missed(state.work[b], planes, crews, row)
     income = 0.0
     cost = 0.0
     available = 0
@@ -216,6 +237,9 @@ def hour(state: State, rules: Rules, b: int) -> tuple[float, float, int, int]:
             plane.job_done += 1
             crews[plane.crew].job_done = plane.job_done
             cost += plane.job_cost
+            state.work[b, plane.crew, REPAIRED] += 1
+            if state.timeline.shape[0] > 0:
+                state.jobs[b, row.time, plane.crew] = slot
         else:
             fly(plane, slot, rules.usage, rules.failure, time_word)
             if plane.mission_hours > 0:
@@ -319,6 +343,8 @@ def require_consistent(state: State, rules: Rules, batch: int) -> None:
     slots, crews, hours = state.planes.shape[1], state.crews.shape[1], state.series.shape[1]
     fit = state.rows.shape[0] == state.planes.shape[0] == state.crews.shape[0] == state.series.shape[0] == batch
     fit &= rules.horizon <= hours and (state.timeline.shape[0] == 0 or state.timeline.shape == (batch, hours, slots))
+    fit &= state.work.shape[0] == batch and state.work.shape[1] == crews
+    fit &= state.timeline.shape[0] == 0 or state.jobs.shape == (batch, hours, crews)
     fit &= state.past.shape[0] == batch and state.past.shape[2] == slots
     fit &= state.private_memory_at.shape == state.private_memory.shape and state.private_memory_at.shape[0] in (
         0,

@@ -178,8 +178,9 @@ class AirmeSimulator(TurnSimulator):
         )
         self.limits[b] = self.view.limits_in(row["episode"])
         state.series[b] = 0.0
+        state.work[b] = 0
         if len(state.timeline):
-            state.timeline[b] = 0
+            state.timeline[b] = state.jobs[b] = 0
         if state.past.shape[1]:
             state.past[b] = planes
         if len(state.private_memory_at):
@@ -239,6 +240,23 @@ class AirmeSimulator(TurnSimulator):
         hours = np.maximum(self.time, 1)
         return {name: self.state.rows["sums"][:, k] / hours for k, name in enumerate(dynamics.OBJECTIVES)}
 
+    def agent_figures(self) -> dict[str, np.ndarray]:
+        """What every crew did so far, float64 (B, C); see TurnSimulator.agent_figures.
+
+        utilisation and idle: shares of hours in repair and free; idle_with_work: share of hours free while a broken
+        plane stood unattended; repairs: begun.
+        """
+        there = np.arange(self.max_agents) < self.n_agents[:, None]
+        hours = np.maximum(self.time, 1)[:, None]
+        work = np.where(there[:, :, None], self.state.work, np.nan)
+        busy = work[:, :, dynamics.REPAIRED] / hours
+        return {
+            "utilisation": busy,
+            "idle": 1.0 - busy,
+            "idle_with_work": work[:, :, dynamics.MISSED] / hours,
+            "repairs": work[:, :, dynamics.BEGUN],
+        }
+
     def snapshot(self, env_index: int) -> dict[str, np.ndarray]:
         """Copies of a row's books, planes and crews."""
         return {name: getattr(self.state, name)[env_index].copy() for name in ("rows", "planes", "crews")}
@@ -274,6 +292,8 @@ def _new_state(batch: int, planes: int, crews: int, horizon: int, staleness: int
         crews=np.zeros((batch, crews), dynamics.CREW),
         series=np.zeros((batch, horizon, 3)),
         timeline=np.zeros((batch, horizon, slots) if timeline else (0, 0, 0), np.uint8),
+        jobs=np.zeros((batch, horizon, crews) if timeline else (0, 0, 0), np.int32),
+        work=np.zeros((batch, crews, 3), np.int64),
         past=np.zeros((batch, staleness + 1 if staleness else 0, slots), dynamics.PLANE),
         private_memory=np.zeros(memory, dynamics.PLANE),
         private_memory_at=np.full(memory, -1, np.int64),

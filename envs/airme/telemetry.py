@@ -290,6 +290,8 @@ def _empty_state(frame: Frame) -> State:
         crews=np.zeros((1, frame.max_crews), CREW),
         series=np.zeros((1, 0, len(OBJECTIVES))),
         timeline=np.zeros((0, 0, 0), np.uint8),
+        jobs=np.zeros((0, 0, 0), np.int32),
+        work=np.zeros((0, 0, 0), np.int64),
         past=np.zeros((1, frame.staleness + 1 if frame.staleness else 0, slots), PLANE),
         private_memory=np.zeros(memory, PLANE),
         private_memory_at=np.full(memory, -1, np.int64),

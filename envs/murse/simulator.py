@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from marl_sched.envs.murse import dynamics, graph, observation, rules
+from marl_sched.envs.murse.agent_books import executed_by_agent
 from marl_sched.envs.murse.generate import SCALES
 from marl_sched.envs.murse.instance import DURATIONS, PROXIMITY, MurseInstance
 from marl_sched.envs.murse.state import NOBODY, load_instance, new_state
@@ -258,6 +259,22 @@ class MurseSimulator(TurnSimulator):
             "conflicts": rounds["conflicts"],
         }
         return {name: np.where(ended, values, np.nan) for name, values in measures.items()}
+
+    def agent_figures(self) -> dict[str, np.ndarray]:
+        """What every robot and human did, float64 (B, A), means over the ended rounds; see TurnSimulator.agent_figures.
+
+        utilisation, idle: shares of the rounds' makespans at work and not; waiting: share before the agent's last task
+        and not at work; tasks; tardiness: by how much its tasks ended after their deadlines in all; late: how many did.
+        Of a round that got stuck, what was done of it counts.
+        """
+        ended = np.maximum(self.state.rows["round"].astype(np.float64), 1.0)[:, None]
+        sums = executed_by_agent(self.state, self.max_agents)
+        there = np.arange(self.max_agents) < self.n_agents[:, None]
+        span = np.maximum(sums.pop("span"), 1.0)[:, None]
+        busy = sums.pop("busy") / span
+        shares = {"utilisation": busy, "idle": 1.0 - busy, "waiting": sums.pop("last") / span - busy}
+        figures = shares | {name: total / ended for name, total in sums.items()}
+        return {name: np.where(there, values, np.nan) for name, values in figures.items()}
 
     def round_results(self, env_index: int) -> np.ndarray:
         """A copy of the ended rounds' results, state.ROUND (n,)."""

@@ -333,6 +333,7 @@ def print_report(report: dict[str, Any]) -> None:
         f"{report['time']} {report['unit']}, {len(report['agents'])} agents, {len(report['decisions'])} decisions"
     )
     typer.echo(f"M1 ({report['objective']}): {report['M1']:.4f}")
+    _print_shares(report["agents"])
     if "from_log" in report:
         return
     typer.echo(f"{messages['count']} messages, {messages['bytes']} bytes")
@@ -341,6 +342,18 @@ def print_report(report: dict[str, Any]) -> None:
     for death in report["deaths"]:
         where = ", ".join(f"{name} {value}" for name, value in death.items())
         typer.echo(f"lost: {where}")
+
+
+def _print_shares(agents: list[dict[str, Any]]) -> None:
+    """How evenly the agents worked, where the environment counts that."""
+    shares = {one["name"]: one["figures"].get("utilisation") for one in agents}
+    if not agents or None in shares.values():
+        return
+    least, most = min(shares, key=shares.__getitem__), max(shares, key=shares.__getitem__)
+    typer.echo(
+        f"utilisation of agents: {sum(shares.values()) / len(shares):.3f}, "
+        f"from {least} {shares[least]:.3f} to {most} {shares[most]:.3f}"
+    )
 
 
 def _by_agent(pairs: list[str]) -> dict[str, str]:

@@ -26,6 +26,8 @@ SaveSchedules = Annotated[
     Path | None, typer.Option("--save-schedules", metavar="DIR", help="Write every round's schedule here, as JSON.")
 ]
 
+Agents = Annotated[bool, typer.Option("--agents", help="Print also what single agents did.")]
+
 
 def add_to(app: typer.Typer) -> None:
     """Register this file's commands."""
@@ -41,9 +43,11 @@ def evaluate(
     *,
     json: options.JsonFile = None,
     format: options.Format = "table",
+    agents: Agents = False,
     save_schedules: SaveSchedules = None,
 ) -> None:
     """Play schedulers on the same instances with the same noise and print their scores."""
+    from marl_sched.cli.agents_table import print_agents
     from marl_sched.cli.tables import FORMATS, print_scores
     from marl_sched.errors import require
     from marl_sched.files import STDOUT, write_json
@@ -54,6 +58,8 @@ def evaluate(
         options.check_folder(save_schedules, "--save-schedules")
     results = play(selection.resolve(), selection.baseline, save_schedules)
     print_scores(results, format, stderr=json == STDOUT)  # first: what was computed is seen, whatever the disk says
+    if agents:
+        print_agents(results, format, stderr=json == STDOUT)
     if json is not None:
         write_json(json, results)
 
@@ -64,11 +70,13 @@ def compare(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results and the plots.")],
     json: options.JsonFile = None,
     format: options.Format = "table",
+    agents: Agents = False,
     log: Annotated[
         list[Path] | None, typer.Option("--log", metavar="CSV", help="A training log to plot; may be repeated.")
     ] = None,
 ) -> None:
     """As evaluate, and draw the scores, an episode of every scheduler and the learning curves of training logs."""
+    from marl_sched.cli.agents_table import print_agents
     from marl_sched.cli.tables import FORMATS, print_scores
     from marl_sched.domain import get_domain
     from marl_sched.errors import InvalidOptionError, require
@@ -86,6 +94,8 @@ def compare(
     resolved = selection.resolve()
     results = play(resolved, selection.baseline)
     print_scores(results, format, stderr=json == STDOUT)
+    if agents:
+        print_agents(results, format, stderr=json == STDOUT)
     for path in (out / "results.json", json):
         if path is not None:
             write_json(path, results)

@@ -26,6 +26,7 @@ from marl_sched.graph import VISIBLE_SHARE
 from marl_sched.problem import Problem, view_as_json
 from marl_sched.simulation import TurnSimulator
 from marl_sched.statistics import Summary, paired_difference, percent_gain, summarise
+from marl_sched.train.evaluation.agents import joined_figures, summarise_agents
 from marl_sched.train.evaluation.gaps import by_instance, gaps
 
 SCHEMA = 2  # 1 named the horizon by its unit, as `hours`
@@ -49,6 +50,7 @@ class Scores:
         visible_share: share of the graph that acting agents saw, mean over turns.
         seconds: wall time of all episodes, simulation included.
         per_round: the simulator's and the scheduler's `per_round()`, name -> float64 (I, E, rounds).
+        agents: the simulator's `agent_figures()` at the end of each episode, name -> float64 (I, E, agents).
         needs: what the scheduler uses beyond the acting agent's observation, "" for nothing.
     """
 
@@ -57,6 +59,7 @@ class Scores:
     seconds: float
     needs: str = ""
     per_round: Mapping[str, np.ndarray] = field(default_factory=dict)
+    agents: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
 def evaluate_scheduler(
@@ -77,6 +80,7 @@ def evaluate_scheduler(
     total = problem.count * problem.episodes
     measures: list[dict[str, np.ndarray]] = []
     per_round: list[dict[str, np.ndarray]] = []
+    agents: list[dict[str, np.ndarray]] = []
     shares = _Shares(total, progress)
     for rows in _chunks(total, max_rows or _rows_that_fit(problem)):
         simulator = problem.simulator([row // problem.episodes for row in rows], **own_options(scheduler, problem))
@@ -86,10 +90,12 @@ def evaluate_scheduler(
         if ended is not None:
             ended(simulator, rows)
         measures.append(simulator.objectives())
+        agents.append(simulator.agent_figures())
         per_round.append({**simulator.per_round(), **scheduler.per_round()})
     return Scores(
         measures=_joined(measures, problem.count),
         per_round=_joined(per_round, problem.count),
+        agents=joined_figures(agents, problem.count),
         visible_share=shares.mean,
         seconds=time.perf_counter() - started,
         needs=str(scheduler.privileged_info),
@@ -226,9 +232,18 @@ class Table:
         row["difference"] = {"to": self.baseline[0], **difference.as_json()}
         row["visible_share"] = scores.visible_share
         row["local"] = scores.visible_share <= LOCAL_SHARE
+        if scores.agents:
+            row["agents"] = summarise_agents(dict(scores.agents), self._agents)
         row["needs"] = scores.needs
         row["seconds"] = scores.seconds
         return row
+
+    @property
+    def _agents(self) -> list[str] | None:
+        """The agents' names where there is one instance only."""
+        if self.problem.count > 1:
+            return None
+        return self.problem.domain.agent_names(self.problem.instances[0], int(self.problem.simulator().n_agents[0]))
 
     def _summary(self, values: np.ndarray) -> Summary:
         return summarise(values)
