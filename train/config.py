@@ -65,9 +65,11 @@ class CurriculumConfig(Group, frozen=True, kw_only=True):
 
 
 class ValidationConfig(Group, frozen=True, kw_only=True):
-    """Evaluation every so many updates on fixed instances of the first scale, `length` None: whole episodes.
+    """Evaluation every so many updates on fixed instances of every scale, `length` None: whole episodes.
 
-    `mode` is how the policy decides there, and then wherever its card is loaded.
+    Policies are compared by the mean over scales of M1; `baseline`, a scheduler's name, is one whose M1 each scale's is
+    divided by, so that every scale counts the same. `mode` is how the policy decides there, and then wherever its card
+    is loaded.
     """
 
     every: Count
@@ -76,6 +78,7 @@ class ValidationConfig(Group, frozen=True, kw_only=True):
     seed: Seed
     length: Count | None
     mode: Mode
+    baseline: str | None = None
 
 
 class CollectorConfig(Group, frozen=True, kw_only=True):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import msgspec
@@ -19,14 +19,16 @@ from marl_sched.train.evaluation.evaluate import evaluate_scheduler
 CONFIG, BEST = "config.json", "policy.safetensors"  # in a run's directory
 
 
-def save_best(network: PolicyNetwork, record: RunRecord, update: int, score: float, directory: Path) -> None:
-    """Write `policy.safetensors` and its card into the run's directory; `score` is M1 on the validation set."""
+def save_best(
+    network: PolicyNetwork, record: RunRecord, update: int, means: Mapping[str, float], directory: Path
+) -> None:
+    """Write `policy.safetensors` and its card into the run's directory; `means` is M1 on each validation set."""
     config = record.config
     validation = config.validation
     domain = get_domain(config.env.name)
     measured = {
-        "scale": config.env.scales[0],
-        "M1": score,
+        "scale": ", ".join(means),
+        "M1": next(iter(means.values())) if len(means) == 1 else dict(means),
         "instances": validation.instances,
         "episodes": validation.episodes,
         "seed": validation.seed,

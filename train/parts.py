@@ -53,11 +53,13 @@ class Parts:
         config = self.record.config
         if counters.update % config.validation.every and counters.update != config.updates:
             return {}
-        score = self.validation(self.learner.policy)
+        means = self.validation(self.learner.policy)
+        score = self.validation.score(means)
         if counters.best is None or self.validation.prefers(score, counters.best):
             counters.best = score
-            save_best(self.learner.policy, self.record, counters.update, score, directory)
-        return {"validation": score, "best": counters.best}
+            save_best(self.learner.policy, self.record, counters.update, means, directory)
+        by_scale = {f"validation_{scale}": mean for scale, mean in means.items()} if len(means) > 1 else {}
+        return {"validation": score, **by_scale, "best": counters.best}
 
     def save(self, counters: Counters, directory: Path, *, now: bool = False) -> None:
         """Write a checkpoint if it is time to, or `now`."""

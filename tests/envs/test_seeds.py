@@ -121,6 +121,6 @@ def test_the_trainers_instances_are_neither_validated_nor_evaluated_on():
     config = load_config(["env=airme", "validation.instances=20", f"validation.seed={seed}", f"seed={seed}"])
     source = InstanceSource(domain, ["small"], seed=seed, rows=20)
     trained = {source(row, 0).identity for row in range(20)}
-    validated = {instance.identity for instance in Validation(config)._problem.instances}
+    validated = {instance.identity for instance in Validation(config)._problems["small"].instances}
     evaluated = {instance.identity for instance in domain.instances("small", 20, seed)}
     assert len(trained | validated | evaluated) == 60

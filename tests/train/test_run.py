@@ -12,12 +12,15 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from marl_sched.agents.policies.cards import read_card, source_revision
 from marl_sched.agents.policies.network_policy import NetworkPolicy
+from marl_sched.agents.registry import create_scheduler
+from marl_sched.domain import get_domain
 from marl_sched.errors import InvalidFileError, InvalidOptionError
 from marl_sched.files import read_json, write_json
 from marl_sched.train.callbacks import Callback, Run
 from marl_sched.train.checkpoint import Counters
 from marl_sched.train.collect import Rollout
 from marl_sched.train.config import RunRecord, load_config, load_record
+from marl_sched.train.evaluation.evaluate import evaluate_scheduler
 from marl_sched.train.logging import RunLog
 from marl_sched.train.parts import build
 from marl_sched.train.run import resume, train, train_from_overrides
@@ -42,6 +45,12 @@ ROLLOUT_IMITATION = [
     "policy.width=2", "policy.heads=2", "policy.hidden=4", "algorithm.instances=4", "algorithm.turns=12",
     "algorithm.minibatch=16", "updates=4", "save_every=2", "validation.every=2", "validation.instances=2",
     "validation.length=1",
+]  # fmt: skip
+
+
+SELF_LABELLING = [
+    "algorithm=self_labelling", *(word for word in TINY if ".ppo." not in word), "algorithm.instances=2",
+    "algorithm.episodes=2",
 ]  # fmt: skip
 
 
@@ -81,10 +90,20 @@ def rows(directory: Path) -> list[dict[str, str]]:
         IPPO,
         STATE_VALUE,
         RANDOM_VIEW,
+        SELF_LABELLING,
         pytest.param(IMITATION, marks=pytest.mark.slow),
         pytest.param(ROLLOUT_IMITATION, marks=pytest.mark.slow),
     ],
-    ids=["gae", "step_baseline", "ippo", "state_value", "random view", "imitation", "rollout_imitation"],
+    ids=[
+        "gae",
+        "step_baseline",
+        "ippo",
+        "state_value",
+        "random view",
+        "self_labelling",
+        "imitation",
+        "rollout_imitation",
+    ],
 )
 def test_a_resumed_run_ends_as_one_that_never_stopped(
     overrides: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -233,6 +252,21 @@ def test_the_best_score_is_the_lowest_where_lower_is_better(better: str, best: f
     assert validation.prefers(best, 0.6)
     assert not validation.prefers(0.6, best)
     assert not validation.prefers(best, best)
+
+
+def test_every_scale_is_validated_and_counts_by_its_ratio_to_the_baseline():
+    words = ["env=murse", "env.scales=[small,medium]", "+env.options.durations=deterministic"]
+    words += ["validation.instances=3", "validation.length=1", "validation.baseline=lst", "policy=hetgat_residual"]
+    config = load_config(words)
+    validation = Validation(config)
+    network = config.policy.build(get_domain("murse").make_simulator(validation._problems["small"].instances).graph)
+    means = validation(network)
+    for scale, problem in validation._problems.items():
+        played = evaluate_scheduler(problem, NetworkPolicy(network, domain="murse"))
+        assert means[scale] == played.measures["makespan"].mean()
+    base = {s: evaluate_scheduler(p, create_scheduler("lst", "murse")) for s, p in validation._problems.items()}
+    ratios = [means[scale] / one.measures["makespan"].mean() for scale, one in base.items()]
+    assert validation.score(means) == pytest.approx(sum(ratios) / 2)
 
 
 def test_hooks_are_called_in_their_order_and_leave_the_run_as_it_is(tmp_path: Path):
