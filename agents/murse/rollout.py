@@ -29,7 +29,7 @@ from marl_sched.simulation import TurnSimulator
 
 CHARGES = np.array([0.0, 2.0])
 LATE_CHARGE = 2.0  # of a unit of lateness, in units of makespan
-INFEASIBLE_CHARGE = 0.2  # of any lateness at all, as a share of the makespan
+INFEASIBLE_CHARGE = 0.5  # of any lateness at all, as a share of the makespan
 WAIT_CHARGE = 0.005  # of waiting, as a share of the cost: it is chosen only where it is worth something
 COMPACT_CHARGE = 0.05  # of the mean finish of tasks: what tells schedules of the same makespan apart
 

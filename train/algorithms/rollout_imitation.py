@@ -34,7 +34,7 @@ from marl_sched.train.ppo import between, importance_subsample, means, minibatch
 if TYPE_CHECKING:
     from marl_sched.train.config import TrainConfig
 
-WORST = 0.5
+WORST = 1.0
 """The excess cost that a choice counts with at most, except by cross-entropy."""
 
 
