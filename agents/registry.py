@@ -68,9 +68,10 @@ def scheduler_names(domain: str) -> list[str]:
 def create_scheduler(name_or_path: str | Path, domain: Domain | str, **options: Any) -> Scheduler:
     """The scheduler of that name, of that `package.module:factory`, or the policy in that file, for a domain.
 
-    `options` are those of the rule, or of `load_policy`; unknown ones raise TypeError. Raises
-    UnknownNameError for a name that nobody has, and InvalidFileError for a file that is damaged or holds
-    another domain's policy.
+    `options` are those of the rule, or of `load_policy`; unknown ones raise TypeError. With `samples` the best of so
+    many schedules that a policy samples is followed, where the domain has such a thing (`Domain.best_of`). Raises
+    UnknownNameError for a name that nobody has, and InvalidFileError for a file that is damaged or holds another
+    domain's policy.
     """
     domain_name = domain if isinstance(domain, str) else domain.name
     table = rules(domain_name)
@@ -79,11 +80,21 @@ def create_scheduler(name_or_path: str | Path, domain: Domain | str, **options: 
     if is_object_name(str(name_or_path)):
         return _create_named(str(name_or_path), options)
     _require_known(name_or_path, domain_name)
+    samples = options.pop("samples", None)
     policy = load_policy(name_or_path, **options)
     if policy.card is not None and policy.card.domain != domain_name:
         card_path = Path(name_or_path).with_suffix(".json")
         raise InvalidFileError(card_path, "domain", f"a policy for {domain_name}", policy.card.domain)
-    return policy
+    return policy if samples is None else _best_of(policy, samples, domain_name)
+
+
+def _best_of(policy: NetworkPolicy, samples: int, domain: str) -> Scheduler:
+    """What follows the best of so many samples of a policy; InvalidOptionError where the domain has no such thing."""
+    best_of = get_domain(domain).best_of
+    if best_of is None:
+        raise InvalidOptionError(f"scheduler {policy.name}: samples: schedules of {domain} are not sampled")
+    made: Scheduler = best_of(policy, samples)
+    return made
 
 
 def _create_named(where: str, options: Mapping[str, Any]) -> Scheduler:

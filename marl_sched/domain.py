@@ -193,6 +193,8 @@ class Domain:
         pressing: (metagraph, observation of it) -> the legal actions, bool (B, n_actions), one of which a greedy policy
             takes before it does nothing; None: there are none such.
         legend: what the colours of the `rgb_array` picture mean, meaning -> RGB in 0 .. 255; None: it needs none.
+        best_of: (trained policy, number of samples) -> a scheduler that follows the best of the policy's sampled
+            schedules, `NAME@samples=K` for users; None: the domain has no such thing.
         band: what a band of the `rgb_array` picture is and how many pixels high, such as ("plane", 4); None: the
             picture brings axes of its own.
     """
@@ -220,6 +222,7 @@ class Domain:
     feasible: Callable[[Any], bool] | None = None
     benchmarks: Callable[[Any, int], Mapping[str, Any]] | None = None
     bound: str | None = None
+    best_of: Callable[[Any, int], Any] | None = None
     generate_accepted: Callable[[str, np.random.Generator, Callable[[Any], bool]], Any] | None = None
     impossibilities: Callable[[Any], list[str]] = _none_known
     instance_files: Callable[[Path], list[Path]] = _json_files

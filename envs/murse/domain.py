@@ -33,6 +33,7 @@ MURSE = Domain(
     unit="rounds",
     better="lower",
     schedulers="marl_sched.agents.murse.schedulers:RULES",
+    best_of=lazy("marl_sched.agents.murse.sampling:BestOfSamples"),
     feasible=lazy("marl_sched.agents.murse.schedulers:IS_FEASIBLE"),
     benchmarks=lazy("marl_sched.agents.murse.bench:benchmarks"),
     generate_accepted=generate,

@@ -118,12 +118,12 @@ def create_schedulers(domain: Domain, names: Iterable[str], time_limit: float | 
 
 
 def scheduler_options(domain: Domain, name: str) -> list[str]:
-    """The options that a domain's rule can be given by name; none for a policy, or a name that nobody has."""
+    """The options that a scheduler can be given by name: a rule's own; of a policy `samples`, where there is that."""
     from marl_sched.agents.registry import rules
 
     factory = rules(domain).get(name)
     if factory is None:
-        return []
+        return [] if domain.best_of is None else ["samples"]
     parameters = inspect.signature(factory).parameters.values()
     return [one.name for one in parameters if one.kind in (one.POSITIONAL_OR_KEYWORD, one.KEYWORD_ONLY)]
 
