@@ -79,6 +79,13 @@ def require_budget(name: str, evaluations: int | None, seconds: float | None) ->
         raise InvalidOptionError(f"{name}: seconds: expected a number > 0, got {seconds}")
 
 
+def require_margin(name: str, margin: float) -> float:
+    """A margin on durations as it is; InvalidOptionError for a negative or infinite one."""
+    if not 0.0 <= margin < np.inf:
+        raise InvalidOptionError(f"{name}: margin: expected a number >= 0, got {margin}")
+    return margin
+
+
 @dataclass(frozen=True, eq=False)
 class _Partial:
     """What is committed to in a round, as `complete` takes it: the first `count` of `order`, int64 (N,) each."""
@@ -132,9 +139,7 @@ class LeastLatestStart(PlanningScheduler):
 
     def __init__(self, margin: float = 0.0) -> None:
         super().__init__()
-        if not 0.0 <= margin < np.inf:
-            raise InvalidOptionError(f"{self.name}: margin: expected a number >= 0, got {margin}")
-        self.margin = margin
+        self.margin = require_margin(self.name, margin)
 
     def plan(self, simulator: MurseSimulator, env_index: int) -> Plan:
         """The rule's schedule of the whole round."""

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from marl_sched.agents.base import CostScheduler, PrivilegedInfo
+from marl_sched.agents.base import CostScheduler, PrivilegedInfo, Scheduler
+from marl_sched.agents.murse.lst import MARGIN, require_margin
 from marl_sched.agents.murse.snapshot import as_murse
 from marl_sched.envs.murse.dynamics import IDLE_AFTER_CONFLICT
 from marl_sched.envs.murse.instance import NO_DEADLINE
@@ -17,6 +18,7 @@ from marl_sched.envs.murse.lookahead import (
     new_outlook,
     next_event,
     problem_of,
+    rule_target,
     without_padding,
     work_out,
 )
@@ -62,10 +64,10 @@ def waits_until(state: State, b: int, viewer: int, sight: Sight) -> int:
 
 
 @kernel
-def costs_of_choices(state: State, rules: Rules, legal: np.ndarray, costs: np.ndarray) -> None:
+def costs_of_choices(state: State, rules: Rules, margin: float, legal: np.ndarray, costs: np.ndarray) -> None:
     """Write float64 (B, targets), in time units; inf where `legal`, int8 (B, targets), forbids it or nothing follows.
 
-    A legal task that is taken in truth costs its agent IDLE_AFTER_CONFLICT.
+    `margin` is that of lookahead.take_stock. A legal task that is taken in truth costs its agent IDLE_AFTER_CONFLICT.
     """
     sight, outlook, trial = new_sight(state), new_outlook(state), new_outlook(state)
     for b in range(len(costs)):
@@ -74,7 +76,7 @@ def costs_of_choices(state: State, rules: Rules, legal: np.ndarray, costs: np.nd
         if viewer == NOBODY:
             continue
         survey(state, rules, b, viewer, EVERYWHERE, EVERYWHERE, sight)
-        work_out(state, b, sight, outlook)
+        work_out(state, b, sight, margin, outlook)
         n, m, clock = state.rows[b].n_tasks, state.rows[b].n_agents, state.rows[b].clock
         problem, now = problem_of(state, b, outlook), without_padding(outlook.now, n, m)
         then, wakes = without_padding(trial.now, n, m), waits_until(state, b, viewer, sight)
@@ -98,18 +100,74 @@ def costs_of_choices(state: State, rules: Rules, legal: np.ndarray, costs: np.nd
 
 
 class LatestStartRollout(CostScheduler):
-    """Takes the choice of least cost, ties to the lower index."""
+    """Takes the choice of least cost, ties to the lower index. Raises InvalidOptionError for a negative margin.
+
+    `margin` standard deviations of each duration are added to what the team expects.
+    """
 
     name = "lst-rollout"
     privileged_info = PrivilegedInfo.DURATIONS | PrivilegedInfo.WAITS | PrivilegedInfo.DEADLINES | PrivilegedInfo.PLACES
+
+    def __init__(self, margin: float = 0.0) -> None:
+        self._margin = require_margin(self.name, margin)
 
     def costs(self, simulator: TurnSimulator, legal: np.ndarray) -> np.ndarray:
         """See costs_of_choices."""
         murse = as_murse(simulator)
         costs = np.full(legal.shape, np.inf)
-        costs_of_choices(murse.state, murse.rules, legal, costs)
+        costs_of_choices(murse.state, murse.rules, self._margin, legal, costs)
         return costs
 
     def decide(self, simulator: TurnSimulator) -> np.ndarray:
         """Targets int64 (B,)."""
         return self.costs(simulator, simulator.legal()).argmin(axis=1)
+
+
+class RobustRollout(LatestStartRollout):
+    """`lst-rollout` with the margin of `lst-robust`."""
+
+    name = "lst-robust-rollout"
+
+    def __init__(self, margin: float = MARGIN) -> None:
+        super().__init__(margin)
+
+
+@kernel
+def choices_by_rule(
+    state: State, rules: Rules, sensing: float, comm: float, margin: float, targets: np.ndarray
+) -> None:
+    """Write what the latest-start rule has the acting agents do, int64 (B,), on what they see; 0 where nobody acts."""
+    sight, outlook = new_sight(state), new_outlook(state)
+    for b in range(len(targets)):
+        viewer, targets[b] = state.rows[b].acting, 0
+        if viewer != NOBODY:
+            survey(state, rules, b, viewer, sensing, comm, sight)
+            count = work_out(state, b, sight, margin, outlook)
+            targets[b] = rule_target(state, b, viewer, count, outlook)
+
+
+class LocalLst(Scheduler):
+    """The latest-start rule run by every agent by itself, whenever it decides, on what it sees under its view.
+
+    Raises InvalidOptionError for a negative margin, of which so many standard deviations are added to durations.
+    """
+
+    name = "lst-local"
+
+    def __init__(self, margin: float = 0.0) -> None:
+        self._margin = require_margin(self.name, margin)
+
+    def decide(self, simulator: TurnSimulator) -> np.ndarray:
+        """Targets int64 (B,)."""
+        murse, targets = as_murse(simulator), np.zeros(simulator.batch, np.int64)
+        choices_by_rule(murse.state, murse.rules, *murse.view.limits, self._margin, targets)
+        return targets
+
+
+class RobustLocalLst(LocalLst):
+    """`lst-local` with the margin of `lst-robust`."""
+
+    name = "lst-robust-local"
+
+    def __init__(self, margin: float = MARGIN) -> None:
+        super().__init__(margin)

@@ -11,7 +11,7 @@ from marl_sched.agents.murse.lst import LeastLatestStart, LstSearch, RobustLst
 from marl_sched.agents.murse.negotiated import Cbba, Tessi, TessiSlack
 from marl_sched.agents.murse.optimal import ExactScheduler, RollingScheduler, is_feasible
 from marl_sched.agents.murse.published import EdfPublished, GeneticPublished
-from marl_sched.agents.murse.rollout import LatestStartRollout
+from marl_sched.agents.murse.rollout import LatestStartRollout, LocalLst, RobustLocalLst, RobustRollout
 from marl_sched.agents.murse.rules import FirstClaim, RandomRule, edf, hctf
 from marl_sched.agents.murse.tercio import Tercio
 
@@ -33,7 +33,10 @@ RULES: dict[str, Callable[..., Scheduler]] = {
     "genetic-edf": GeneticEdf,
     "genetic-published": GeneticPublished,
     "tercio": Tercio,
+    "lst-local": LocalLst,
+    "lst-robust-local": RobustLocalLst,
     "lst-rollout": LatestStartRollout,
+    "lst-robust-rollout": RobustRollout,
     "exact": ExactScheduler,
     "exact-rolling": RollingScheduler,
 }

@@ -129,8 +129,11 @@ def without_padding(progress: Progress, n: int, m: int) -> Progress:
 
 
 @kernel
-def take_stock(state: State, b: int, sight: Sight, outlook: Outlook) -> None:
-    """Write what is known and how far the round has come: durations, deadlines and `now`."""
+def take_stock(state: State, b: int, sight: Sight, margin: float, outlook: Outlook) -> None:
+    """Write what is known and how far the round has come: durations, deadlines and `now`.
+
+    `margin` standard deviations of each duration are added to it, rounded to whole units.
+    """
     row, now = state.rows[b], outlook.now
     n, m = row.n_tasks, row.n_agents
     now.ready[:m] = row.clock
@@ -143,7 +146,9 @@ def take_stock(state: State, b: int, sight: Sight, outlook: Outlook) -> None:
             now.ready[job.agent] = max(now.ready[job.agent], sight.finish[task])
         for agent in range(m):
             usable = sight.seen[task] and sight.heard[agent] and state.pairs[b, task, agent].true >= 0
-            outlook.durations[task, agent] = state.pairs[b, task, agent].planned if usable else INELIGIBLE
+            pair = state.pairs[b, task, agent]
+            longer = int(np.rint(margin * pair.spread)) if usable else 0
+            outlook.durations[task, agent] = pair.planned + longer if usable else INELIGIBLE
     count, lags, near = 0, state.lags[b], state.near[b]
     for task in range(n):
         now.missing[task], now.earliest[task] = 0, row.clock
@@ -164,9 +169,9 @@ def take_stock(state: State, b: int, sight: Sight, outlook: Outlook) -> None:
 
 
 @kernel
-def work_out(state: State, b: int, sight: Sight, outlook: Outlook) -> int:
-    """Fill an outlook from what a viewer knows; how many tasks the rule's plan dispatches."""
-    take_stock(state, b, sight, outlook)
+def work_out(state: State, b: int, sight: Sight, margin: float, outlook: Outlook) -> int:
+    """Fill an outlook from what a viewer knows; how many tasks the rule's plan dispatches. `margin`: see take_stock."""
+    take_stock(state, b, sight, margin, outlook)
     n, m = state.rows[b].n_tasks, state.rows[b].n_agents
     problem, now = problem_of(state, b, outlook), without_padding(outlook.now, n, m)
     shortest, latest, due = outlook.shortest[:n], outlook.latest[:n], outlook.due[:n]
@@ -294,7 +299,7 @@ def breaks(
 @kernel
 def see_ahead(state: State, b: int, viewer: int, sight: Sight, outlook: Outlook, out: Arrays) -> None:
     """Write the features that look ahead of tasks, pairs, agents and the state; the action mask is there already."""
-    count = work_out(state, b, sight, outlook)
+    count = work_out(state, b, sight, 0.0, outlook)
     row, unit = state.rows[b], state.rows[b].high
     n, m, clock = row.n_tasks, row.n_agents, row.clock
     compare_agents(viewer, n, m, outlook)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -46,14 +46,18 @@ def tables(
     from marl_sched.train.published.entries import Entries
     from marl_sched.train.published.filling import missing
     from marl_sched.train.published.page import write_pages
-    from marl_sched.train.published.plan import load_plan
+    from marl_sched.train.published.plan import as_plan, shipped_list
     from marl_sched.train.published.store import Cells
 
     if render and without_policies:
         raise InvalidOptionError("--render, --without-policies: expected one of them, together nothing is left to do")
     out = out or (QUICK_FOLDER if quick else FOLDER)
     options.check_folder(out)
-    plan = load_plan(env)
+    given, where = shipped_list(env)
+    if "comparisons" in given:
+        _compare(given, where, out, workers, quick=quick, render=render)
+        return
+    plan = as_plan(given, where)
     entries = Entries(plan, plan.quick if quick else plan.full, Path())
     jobs, untrained = entries.all()
     cells = Cells(out / env / "cells.jsonl")
@@ -67,6 +71,30 @@ def tables(
     for path in write_pages(entries, cells, command, out):
         typer.echo(path)
     _tell(untrained)
+
+
+def _compare(given: dict[str, Any], where: str, out: Path, workers: int, *, quick: bool, render: bool) -> None:
+    """The same for a list of comparisons: cells that are missing, then the page."""
+    from marl_sched.files import replacing
+    from marl_sched.train.published.comparison_page import page
+    from marl_sched.train.published.comparisons import as_comparisons, make, missing, places, read_cells, write_cells
+    from marl_sched.train.published.filling import worker_processes
+
+    plan = as_comparisons(given, where)
+    path = out / plan.env / "cells.jsonl"
+    cells = read_cells(path)
+    left = [] if render else missing(places(plan, quick=quick), cells)
+    if left:
+        with worker_processes(min(workers, len(left))) as pool:
+            for place, cell in zip(left, pool.map(make, [place.inputs for place in left]), strict=True):
+                cells[cell.inputs.name] = cell
+                write_cells(path, cells)
+                typer.echo(f"{place.entry.label}, {place.scale}: {cell.cpu_seconds:.1f} s of processor time", err=True)
+    command = f"marl-sched tables --env {plan.env}" + (" --quick" if quick else "")
+    text = page(plan, cells, command, quick=quick)
+    with replacing(out / f"{plan.env}.md") as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    typer.echo(out / f"{plan.env}.md")
 
 
 def _confirm(cells: Cells, jobs: list[Job]) -> None:

@@ -151,13 +151,18 @@ class Plan(_Part, frozen=True, kw_only=True):
 
 def load_plan(env: str) -> Plan:
     """The list that ships for a domain; InvalidOptionError if there is none, InvalidFileError for a damaged one."""
+    return as_plan(*shipped_list(env))
+
+
+def shipped_list(env: str) -> tuple[dict[str, Any], str]:
+    """The list that ships for a domain as plain data, and its name; InvalidOptionError if there is none."""
     get_domain(env)
     source = files("marl_sched.configs").joinpath("published", f"{env}.yaml")
     if not source.is_file():
         raise InvalidOptionError(f"--env: there are no published tables of the environment {env!r}")
     with as_file(source) as path:
-        given = OmegaConf.to_container(OmegaConf.load(path))
-    return as_plan(given, f"configs/published/{env}.yaml")
+        given: Any = OmegaConf.to_container(OmegaConf.load(path))
+    return given, f"configs/published/{env}.yaml"
 
 
 def as_plan(given: Any, where: str) -> Plan:

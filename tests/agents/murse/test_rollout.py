@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 
 from marl_sched.agents.murse.lst import LeastLatestStart
-from marl_sched.agents.murse.rollout import LatestStartRollout
+from marl_sched.agents.murse.rollout import LatestStartRollout, LocalLst
+from marl_sched.domain import get_domain
+from marl_sched.envs.murse.graph import RULE_CHOICE
 from marl_sched.envs.murse.simulator import MurseSimulator
 from marl_sched.envs.murse.views import LocalView
+from marl_sched.errors import InvalidOptionError
 from marl_sched.problem import Problem
 from marl_sched.train.evaluation.evaluate import evaluate_scheduler
 from tests.murse.problems import problem
@@ -30,10 +33,10 @@ def test_costs_of_two_crossed_tasks_by_hand():
     assert costs(MurseSimulator([CROSSED])) == pytest.approx([3.125 * 1.005, 2.1, 9.45, np.inf])
 
 
-def test_lateness_costs_twice_itself_and_a_fifth_of_the_makespan():
-    """As before, task 2 due at 5: behind choice 2 it is 4 late, 9 + 2 x 4 + 0.2 x 9 + 0.45."""
+def test_lateness_costs_twice_itself_and_half_the_makespan():
+    """As before, task 2 due at 5: behind choice 2 it is 4 late, 9 + 2 x 4 + 0.5 x 9 + 0.45."""
     due = problem([[2, 9], [9, 2]], deadlines=[-1, 5])
-    assert costs(MurseSimulator([due]))[2] == pytest.approx(9 + 8 + 1.8 + 0.45)
+    assert costs(MurseSimulator([due]))[2] == pytest.approx(9 + 8 + 4.5 + 0.45)
 
 
 def test_task_that_is_taken_in_truth_costs_a_unit_of_idleness():
@@ -48,6 +51,28 @@ def test_task_that_is_taken_in_truth_costs_a_unit_of_idleness():
 def test_waiting_for_nothing_is_never_chosen():
     """A single robot that waits before anything has begun would wait for ever."""
     assert costs(MurseSimulator([problem([[3]])])) == pytest.approx([np.inf, 3.15, np.inf])
+
+
+def test_the_local_rule_chooses_what_observations_call_the_rules_choice():
+    domain = get_domain("murse")
+    simulator = MurseSimulator(domain.instances("small", 5, 2), view=LocalView(sensing=2.0, comm=2.0), mode="online")
+    for _ in range(12):
+        targets = LocalLst().decide(simulator)
+        rows, observation = simulator.observe_acting()
+        np.testing.assert_array_equal(targets[rows], observation["task"][..., RULE_CHOICE].argmax(axis=1))
+        simulator.step(targets)
+
+
+def test_the_local_rule_that_sees_all_plans_as_the_rule_does():
+    ten = Problem("murse", scale="small", count=10, seed=5, episodes=1, horizon=1)
+    alone, planned = (evaluate_scheduler(ten, scheduler) for scheduler in (LocalLst(), LeastLatestStart()))
+    np.testing.assert_array_equal(alone.measures["makespan"], planned.measures["makespan"])
+
+
+@pytest.mark.parametrize("scheduler", [LatestStartRollout, LocalLst])
+def test_a_negative_margin_is_refused(scheduler: type):
+    with pytest.raises(InvalidOptionError, match="margin: expected a number >= 0, got -1"):
+        scheduler(margin=-1)
 
 
 def test_rollout_is_shorter_than_the_rule_that_it_completes_by():
