@@ -9,7 +9,7 @@ PYTEST_ARGS ?= -n auto --dist worksteal
 
 WORKERS ?= 2
 
-.PHONY: help demo test unit wheel lint coverage tables-airme format clean
+.PHONY: help demo test unit wheel lint coverage tables-airme tables-murse format clean
 
 help: ## what there is to make
 	@grep -hE '^[a-z%-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z%-]+):.*## (.*)/  \1|\2/' | column -t -s '|'
@@ -44,6 +44,9 @@ coverage: $(INSTALLED) ## which lines of what is not compiled no test runs, in b
 	OMP_NUM_THREADS=1 NUMBA_CACHE_DIR=$(CURDIR)/build/numba $(BIN)/pytest --cov --cov-report=term:skip-covered \
 		--cov-report=html:build/coverage $(PYTEST_ARGS)
 
+tables-murse: $(INSTALLED) ## the page about MuRSE in docs/results/, only the cells that are missing
+	$(BIN)/marl-sched tables --env murse --workers $(WORKERS) $(if $(QUICK),--quick)
+
 tables-airme: $(INSTALLED) ## tables 6.2 to 6.4 in docs/results/, only the cells that are missing; QUICK=1: a look, in out/tables/
 	$(BIN)/marl-sched tables --env airme --workers $(WORKERS) $(if $(QUICK),--quick)
 
@@ -58,20 +61,38 @@ TRAIN_airme-local-availability := algorithm=imitation updates=400 view=local env
 TRAIN_airme-any-profit := algorithm=imitation updates=500 view=random
 STALE := view=local view.staleness=12
 
+# Trains the run of the first name by the overrides behind it, or goes on with it where it was stopped.
+trained = if test -e runs/$(1)/config.json; then $(BIN)/marl-sched resume runs/$(1); else \
+	$(BIN)/marl-sched train $(2) run_dir=runs/$(1); fi
+
 policy-%: $(INSTALLED) ## trains a shipped policy again and writes it into agents/policies/shipped/
-	$(BIN)/marl-sched train $(or $(TRAIN_$*),$(error no policy is called $*)) run_dir=runs/$*
+	$(call trained,$*,$(or $(TRAIN_$*),$(error no policy is called $*)))
 	$(BIN)/marl-sched export runs/$* $* --out agents/policies/shipped --episodes 1
 
 # With stale information imitation alone is not enough: what is worth doing depends on what the neighbours do.
 policy-airme-stale-profit: $(INSTALLED)
-	$(BIN)/marl-sched train $(STALE) algorithm=imitation updates=400 run_dir=runs/airme-stale-imitation
-	$(BIN)/marl-sched train $(STALE) algorithm=imitation algorithm.criterion=expected_advantage \
+	$(call trained,airme-stale-imitation,$(STALE) algorithm=imitation updates=400)
+	$(call trained,airme-stale-worth,$(STALE) algorithm=imitation algorithm.criterion=expected_advantage \
 		algorithm.temperature=0.1 algorithm.final_temperature=0.01 algorithm.learning_rate=2e-3 updates=100 \
-		start_from=runs/airme-stale-imitation/policy.safetensors run_dir=runs/airme-stale-worth
-	$(BIN)/marl-sched train $(STALE) algorithm.ppo.critic_alone=0.05 algorithm.ppo.policy_rate=0.1 \
-		algorithm.ppo.entropy=0.0 updates=350 \
-		start_from=runs/airme-stale-worth/policy.safetensors run_dir=runs/airme-stale-profit
+		start_from=runs/airme-stale-imitation/policy.safetensors)
+	$(call trained,airme-stale-profit,$(STALE) algorithm.ppo.critic_warmup=0.05 algorithm.ppo.policy_rate=0.1 \
+		algorithm.ppo.entropy=0.0 updates=350 start_from=runs/airme-stale-worth/policy.safetensors)
 	$(BIN)/marl-sched export runs/airme-stale-profit airme-stale-profit --out agents/policies/shipped --episodes 1
+
+# MuRSE: first what a roll-out of the latest-start rule would choose, then what choices cost on average, so that one is
+# surely made. Each stage takes half an hour of one core at most.
+MURSE := env=murse policy=hetgat_residual algorithm=rollout_imitation curriculum=rounds 'env.scales=[small,medium]' \
+	validation.every=10
+PLANNED := $(MURSE) curriculum.start=1 curriculum.stop=1 +env.options.durations=deterministic validation.length=1
+COSTS := algorithm.criterion=expected_cost algorithm.temperature=0.01 algorithm.final_temperature=0.002 \
+	algorithm.learning_rate=1e-3 validation.instances=150 validation.baseline=lst
+
+policy-murse-full-makespan: $(INSTALLED)
+	$(call trained,murse-full-imitation,$(PLANNED) updates=80 validation.instances=100)
+	$(call trained,murse-full-makespan,$(PLANNED) $(COSTS) updates=120 \
+		start_from=runs/murse-full-imitation/policy.safetensors)
+	$(BIN)/marl-sched export runs/murse-full-makespan murse-full-makespan --out agents/policies/shipped \
+		--scales small,medium,large --episodes 1 --length 1
 
 format: $(INSTALLED) ## sort imports and lay out the code
 	$(BIN)/ruff check --select I --fix .

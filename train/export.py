@@ -73,7 +73,7 @@ def export_policy(
 
     `scales` None: all of the domain's whose padded sizes its network can read. Instances and noise are those of
     `marl-sched evaluate --seed SEED`, the simulator's further options those of the run; `length` is the simulated time
-    of an episode, None: the environment's. Returns the card as written.
+    of an episode, None: the environment's. Returns the card as written. Raises UnknownNameError for an unknown scale.
     """
     network, card = load_network(run_dir / BEST)
     options = load_record(run_dir / CONFIG).config.env.options
@@ -98,6 +98,7 @@ def export_policy(
         measured[scale] = {
             "M1": float(means.mean()),
             "std": float(means.std()),
+            **({"feasible": float(scores.measures["feasible"].mean())} if "feasible" in scores.measures else {}),
             "visible_share": scores.visible_share,
             "options": options,
             "instances": instances,

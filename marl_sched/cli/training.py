@@ -49,6 +49,10 @@ def export(
     instances: Annotated[int, typer.Option("--instances", min=1, help="Generated instances of each scale.")] = 100,
     episodes: Annotated[int, typer.Option("--episodes", min=1, help="Episodes of each instance.")] = 10,
     seed: options.Seed = EXPORT_SEED,
+    scales: Annotated[
+        str | None,
+        typer.Option("--scales", metavar="NAMES", help="Separated by commas (default: all that the network can read)."),
+    ] = None,
     length: Annotated[
         int | None,
         typer.Option("--length", min=1, help="Simulated time of an episode (default: the environment's)."),
@@ -63,9 +67,12 @@ def export(
     options.check_folder(out)
     path = out / f"{name}.safetensors"
     keep_freed_memory()
-    card = export_policy(run_dir, path, instances=instances, episodes=episodes, seed=seed, length=length)
+    chosen = None if scales is None else [scale.strip() for scale in scales.split(",")]
+    card = export_policy(run_dir, path, scales=chosen, instances=instances, episodes=episodes, seed=seed, length=length)
     for scale, measured in card.scores.items():
-        typer.echo(f"{scale}: M1 {measured['M1']:.4f}")
+        found = measured["M1"] if isinstance(measured["M1"], dict) else {scale: measured["M1"]}
+        means = ", ".join(f"{name} {mean:.4f}" if len(found) > 1 else f"{mean:.4f}" for name, mean in found.items())
+        typer.echo(f"{scale}: M1 {means}")
     typer.echo(path)
 
 

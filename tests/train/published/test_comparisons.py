@@ -1,0 +1,117 @@
+"""Comparisons: figures of a page by hand from made-up cells, what is missing, and lists that are wrong."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from pathlib import Path
+
+import pytest
+
+from marl_sched.errors import InvalidFileError, MarlSchedError
+from marl_sched.train.published.comparison_page import page
+from marl_sched.train.published.comparisons import (
+    Cell,
+    Comparisons,
+    as_comparisons,
+    make,
+    missing,
+    places,
+    read_cells,
+    write_cells,
+)
+from marl_sched.train.published.plan import shipped_list
+
+ROOT = Path(__file__).resolve().parents[3]
+COMMAND = "marl-sched tables --env murse"
+TINY = {
+    "env": "murse",
+    "objective": "makespan",
+    "seed": 5,
+    "comparisons": [
+        {
+            "title": "Planned",
+            "options": {"durations": "deterministic"},
+            "horizon": 1,
+            "instances": {"small": 4},
+            "baseline": "lst",
+            "exact": "edf",
+            "rows": [
+                {"label": "published", "published": {"small": [61.5, 408.76]}},
+                {"label": "lst", "scheduler": "lst", "remark": "a rule."},
+                {"label": "edf", "scheduler": "edf", "instances": {"small": 2}, "published": {"small": [50, 200]}},
+            ],
+        }
+    ],
+}
+
+
+@pytest.fixture
+def plan() -> Comparisons:
+    return as_comparisons(deepcopy(TINY), "tiny")
+
+
+def cells(plan: Comparisons) -> dict[str, Cell]:
+    made_up = {
+        "lst": ([[100.0], [200.0], [300.0], [400.0]], [[1], [1], [1], [0]]),
+        "edf": ([[80.0], [190.0]], [[1], [0]]),
+    }
+    found = {}
+    for place in places(plan):
+        objective, feasible = made_up[place.entry.label]
+        found[place.inputs.name] = Cell(
+            inputs=place.inputs, objective=objective, feasible=feasible, visible_share=1.0, needs="", cpu_seconds=0.02,
+            revision="0123456789abcdef",
+        )  # fmt: skip
+    return found
+
+
+def test_the_pages_figures_by_hand(plan):
+    """lst: 3 of 4 feasible, mean 250, 100 / 80 over the one round that is feasible for both, 5 ms a round.
+
+    edf on the first two instances: 80 - 100 and 190 - 200, mean -15 of 150, Student's t of one degree of freedom at
+    97.5 percent is 12.706 and the standard error 5: 42.35 percent of 150 to either side.
+    """
+    told = page(plan, cells(plan), COMMAND)
+    assert "| published | *61.5* | *408.76* | - | - | - |" in told
+    assert "| lst | 75.0 | 250.0 | 1.250 | - | 5 |" in told
+    assert "| edf (2 instances) | 50.0 *50* | 135.0 *200* | 1.000 | -10.0 [-52.4, +32.4] | 10 |" in told
+    assert "- lst: a rule." in told
+    assert "`0123456789ab` (2)" in told
+
+
+def test_missing_cells_are_named_with_the_command_and_made(plan, tmp_path: Path):
+    with pytest.raises(MarlSchedError, match="2 cells are missing, lst on small of 'Planned' among them: `marl-sched"):
+        page(plan, {}, COMMAND)
+    (lst, edf) = missing(places(plan), {})
+    made = {place.inputs.name: make(place.inputs) for place in (lst, edf)}
+    write_cells(tmp_path / "cells.jsonl", made)
+    again = read_cells(tmp_path / "cells.jsonl")
+    assert again == made
+    assert [len(again[place.inputs.name].objective) for place in (lst, edf)] == [4, 2]
+    assert not missing(places(plan), again)
+    (tmp_path / "cells.jsonl").write_text("{}\n")
+    with pytest.raises(InvalidFileError, match="line 1"):
+        read_cells(tmp_path / "cells.jsonl")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"baseline": "nobody"}, "unknown row of 'Planned'"),
+        ({"instances": {"tiny": 2}}, "tiny"),
+        ({"options": {"speed": 2}}, "speed"),
+        ({"surplus": 1}, "surplus"),
+    ],
+)
+def test_a_list_that_is_wrong_is_refused(change, message):
+    given = deepcopy(TINY)
+    given["comparisons"][0] |= change
+    with pytest.raises(InvalidFileError, match=message):
+        as_comparisons(given, "tiny")
+
+
+def test_the_committed_page_is_what_the_committed_cells_give():
+    folder = ROOT / "docs" / "results"
+    plan = as_comparisons(*shipped_list("murse"))
+    told = page(plan, read_cells(folder / "murse" / "cells.jsonl"), COMMAND)
+    assert told == (folder / "murse.md").read_text(encoding="utf-8"), "draw it again: make tables-murse"
