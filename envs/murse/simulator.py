@@ -89,7 +89,7 @@ class MurseSimulator(TurnSimulator):
             divisor=float(divisor),
         )
         self.view = view if view is not None else FullView()
-        self.objective, self.mode, self.horizon = objective, mode, horizon
+        self.objective, self.mode, self.horizon, self.simplification = objective, mode, horizon, simplification
         self.instances = [self._with_settings(instance) for instance in instances]
         self.batch = len(self.instances)
         self._allocate(pad, graph.SIMPLIFICATIONS.index(simplification))

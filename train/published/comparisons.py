@@ -23,7 +23,7 @@ from msgspec import Meta, Struct
 from marl_sched.agents.policies.cards import source_revision
 from marl_sched.agents.registry import create_scheduler, rules, shipped_policies
 from marl_sched.domain import get_domain
-from marl_sched.errors import InvalidFileError, InvalidOptionError, require
+from marl_sched.errors import InvalidFileError, InvalidOptionError, UnknownNameError, require
 from marl_sched.files import replacing
 from marl_sched.problem import Problem, view_as_json
 from marl_sched.train.evaluation.evaluate import evaluate_scheduler
@@ -179,7 +179,7 @@ def as_comparisons(given: Any, where: str) -> Comparisons:
         raise InvalidFileError(where, field.strip("`."), f"a list of tables ({reason})") from error
     try:
         _check(plan)
-    except InvalidOptionError as error:
+    except (InvalidOptionError, UnknownNameError) as error:
         raise InvalidFileError(where, "", f"names that exist ({error})") from error
     return plan
 

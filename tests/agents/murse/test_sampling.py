@@ -44,7 +44,9 @@ def test_one_sample_is_the_greedy_policy_and_more_are_never_worse_where_duration
 
 def test_copies_stand_where_the_row_stands_and_leave_it_alone():
     made = simulator(durations="stochastic")
-    play_one_round(made)
+    started = policy(made)
+    while made.progress[1] < 1:
+        made.step(started.decide(made))
     before = made.snapshot(1)
     copies = copies_of(made, 1, 3)
     small = made.instances[1].n_tasks
@@ -52,16 +54,10 @@ def test_copies_stand_where_the_row_stands_and_leave_it_alone():
     for name in ("planned", "spread"):
         known = made.state.pairs[name][1, :small, : made.instances[1].n_agents]
         np.testing.assert_array_equal(copies.state.pairs[name], np.stack([known] * 3))
-    play_one_round(copies)
+    while copies.progress.min() < 2:
+        copies.step(started.decide(copies))
     after = made.snapshot(1)
     assert all(np.array_equal(before[name], after[name]) for name in before)
-
-
-def play_one_round(made: MurseSimulator) -> None:
-    started = policy(made)
-    while (open_rows := (made.progress == made.progress.min()) & (made.acting >= 0)).any():
-        legal = made.legal()
-        made.step(np.where(open_rows, started.decide(made), legal.argmax(axis=1)))
 
 
 def test_what_is_not_planned_is_refused():
