@@ -161,3 +161,16 @@ def best_action(score: np.ndarray, eligible: np.ndarray) -> np.ndarray:
     masked = np.where(eligible, score, -np.inf)
     best = masked.argmax(axis=1)
     return np.where(eligible.any(axis=1), best, 0).astype(np.int64)
+
+
+def inverse_distribution(logits: np.ndarray, uniform: np.ndarray) -> np.ndarray:
+    """For each row the first action whose cumulated probability exceeds the row's uniform.
+
+    logits (B, n_actions), with at least one that is not the lowest finite number; uniform float64 (B,) in
+    [0, 1); returns int64 (B,). Actions of probability zero are never picked.
+    """
+    weights = np.exp(logits.astype(np.float64) - logits.max(axis=1, keepdims=True))
+    cumulated = weights.cumsum(axis=1)
+    # A uniform next to 1 may round up to the total; the largest number below the total still has an action.
+    level = np.minimum(uniform * cumulated[:, -1], np.nextafter(cumulated[:, -1], 0.0))
+    return (cumulated > level[:, None]).argmax(axis=1)

@@ -15,9 +15,9 @@ from tensordict.nn import InteractionType, TensorDictModuleBase
 from torch import Tensor
 from torchrl.modules import MaskedCategorical, ProbabilisticActor
 
+from marl_sched.agents.base import inverse_distribution
 from marl_sched.agents.networks.compaction import compacted
 from marl_sched.agents.networks.network import PolicyNetwork
-from marl_sched.agents.policies.network_policy import inverse_distribution
 from marl_sched.graph import ACTION_MASK, TIME, VISIBLE_SHARE
 
 LOG_PROB = "action_log_prob"

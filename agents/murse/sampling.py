@@ -7,16 +7,21 @@ followed.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
+from marl_sched.agents.base import inverse_distribution
 from marl_sched.agents.murse.following import PlanningScheduler
 from marl_sched.agents.murse.problem import Plan, plan_cost, timed
 from marl_sched.agents.murse.snapshot import as_murse, estimated_round
-from marl_sched.agents.policies.network_policy import NetworkPolicy, inverse_distribution
 from marl_sched.envs.murse.simulator import MurseSimulator
 from marl_sched.envs.murse.state import NOBODY
 from marl_sched.errors import InvalidOptionError
 from marl_sched.simulation import TurnSimulator
+
+if TYPE_CHECKING:
+    from marl_sched.agents.policies.network_policy import NetworkPolicy
 
 
 class BestOfSamples(PlanningScheduler):

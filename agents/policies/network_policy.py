@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from marl_sched.agents.base import ObservationScheduler
+from marl_sched.agents.base import ObservationScheduler, inverse_distribution
 from marl_sched.agents.networks.batches import logits_in_blocks
 from marl_sched.agents.networks.network import PolicyNetwork
 from marl_sched.agents.policies.cards import Mode, PolicyCard, check_graph
@@ -168,19 +168,6 @@ class NetworkPolicy(ObservationScheduler):
         if len(tensors[ACTION_MASK]) == 1:
             return self._network(tensors, self._weights).numpy()
         return logits_in_blocks(self._network, tensors, self._weights).numpy()
-
-
-def inverse_distribution(logits: np.ndarray, uniform: np.ndarray) -> np.ndarray:
-    """For each row the first action whose cumulated probability exceeds the row's uniform.
-
-    logits (B, n_actions), with at least one that is not the lowest finite number; uniform float64 (B,) in
-    [0, 1); returns int64 (B,). Actions of probability zero are never picked.
-    """
-    weights = np.exp(logits.astype(np.float64) - logits.max(axis=1, keepdims=True))
-    cumulated = weights.cumsum(axis=1)
-    # A uniform next to 1 may round up to the total; the largest number below the total still has an action.
-    level = np.minimum(uniform * cumulated[:, -1], np.nextafter(cumulated[:, -1], 0.0))
-    return (cumulated > level[:, None]).argmax(axis=1)
 
 
 def _tensor(array: np.ndarray) -> Tensor:

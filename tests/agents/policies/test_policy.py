@@ -9,8 +9,9 @@ import pytest
 import torch
 from scipy.stats import chisquare
 
+from marl_sched.agents.base import inverse_distribution
 from marl_sched.agents.networks.hetgat.network import HetGATNetwork
-from marl_sched.agents.policies.network_policy import NetworkPolicy, inverse_distribution
+from marl_sched.agents.policies.network_policy import NetworkPolicy
 from marl_sched.domain import get_domain
 from marl_sched.errors import InvalidOptionError
 from marl_sched.graph import ACTION_MASK, NodeType
