@@ -26,6 +26,7 @@ from marl_sched.comms.protocol import messages as wire
 from marl_sched.comms.protocol.agent_protocol import AgentProtocol
 from marl_sched.comms.protocol.rules import AgentRules
 from marl_sched.comms.transport.base import Transport
+from marl_sched.comms.transport.faulty import Faults, FaultyTransport
 from marl_sched.domain import LocalState, get_domain
 from marl_sched.errors import DeploymentError, InvalidMessageError, InvalidOptionError
 
@@ -159,7 +160,9 @@ def run(options: AgentOptions, progress: Any = None) -> Counter[str]:
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # one decision is too small to share, and stays bit-equal
     log_warnings()
     identity = options.identity()
-    transport = spoke(options.run, options.connect, options.join_timeout, options.lease, identity=identity)
+    transport: Transport = spoke(options.run, options.connect, options.join_timeout, options.lease, identity=identity)
+    if options.faults:
+        transport = FaultyTransport(transport, Faults.of(options.faults), options.agent + 1)
     try:
         with interruptible(transport):
             return Agent(options, transport).run()

@@ -39,9 +39,13 @@ class Resumed(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 
 class Step(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="commit"):
-    """What was applied at once, and what became of it."""
+    """What was applied at once, and what became of it.
+
+    `sources` says for each commit which decision was applied, as `incarnation/sequence`; "" where there was none.
+    """
 
     commits: list[Commit]
+    sources: list[str] = []
 
 
 Line = Header | Resumed | Step

@@ -77,6 +77,8 @@ class Deployment:
         children: "world" or an agent's name -> its process.
         phase, tick, horizon: the world's progress, as it last said.
         folder: where the logs, the run's log and the report are.
+        certs: the folder of certificates, "" without; one of the run's own exists while it lasts.
+        routes: agent -> the endpoint by which it reaches the world, if not the world's own.
     """
 
     def __init__(self, options: DeployOptions) -> None:
@@ -89,7 +91,7 @@ class Deployment:
         for policy in sorted(set(self.policies)):
             _check_policy(policy, options.world.domain())
         self.endpoint = settle_port(options.world.listen)
-        self.certs = options.world.certs  # a folder; while the run lasts one of its own, unless one is given
+        self.certs, self.routes = options.world.certs, dict[int, str]()
         if self.certs:
             self._check_certificates(Path(self.certs))
         self.children: dict[str, Child] = {}
@@ -188,10 +190,11 @@ class Deployment:
             agent=agent,
             policy=self.policies[agent],
             run=self.options.world.run,
-            connect=self.endpoint,
+            connect=self.routes.get(agent, self.endpoint),
             certs=self.certs,
             join_timeout=self.options.world.ready_timeout,
             lease=self.options.world.lease,
+            faults=dict(self.options.world.faults),
         )
         self._start(self._name(agent), "agent", asdict(options))
 
@@ -322,7 +325,9 @@ def deploy(options: DeployOptions, progress: Progress | None = None) -> dict[str
                 stopped.waiting = True
                 report = deployment.wait(progress, lambda: stopped.number)
     except SystemExit as end:
-        report = _no_report(options, Ending.INTERRUPTED, f"signal {int(end.code or 0) - 128}", int(end.code or 0))
+        code = end.code if isinstance(end.code, int) else int(ExitCode.DEFECT)
+        reason = f"signal {code - 128}" if code > 128 else f"the caller ended it: {end.code}"
+        report = _no_report(options, Ending.INTERRUPTED, reason, code)
         raise
     except Exception as error:
         if deployment is not None:  # else it was refused, and nothing was started

@@ -11,6 +11,7 @@ from marl_sched.comms.protocol.keys import run_prefix
 from marl_sched.comms.protocol.rules import ClockKind, WorldRules
 from marl_sched.comms.security.identity import WORLD, Identity
 from marl_sched.comms.transport.endpoints import is_encrypted, is_loopback
+from marl_sched.comms.transport.faulty import Faults
 from marl_sched.domain import Domain, Telemetry, get_domain
 from marl_sched.errors import InvalidOptionError, require
 
@@ -62,6 +63,7 @@ class WorldOptions:
         log: file of the run's commits; a world that is started with the log of its run goes on from there. "": none.
         sync: whether every commit is forced to the disk.
         report: file for the JSON report; "" writes none.
+        faults: what happens to messages of the world, see `Faults`; of its agents too where they are deployed.
     """
 
     env: str
@@ -90,10 +92,12 @@ class WorldOptions:
     log: str = ""
     sync: Sync = "never"
     report: str = ""
+    faults: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Refuse what cannot be run."""
         run_prefix(self.run)
+        Faults.of(self.faults)
         if not self.insecure and not is_loopback(self.listen) and not is_encrypted(self.listen):
             raise InvalidOptionError(
                 f"listen: {self.listen} is reached by other machines, and {INSECURE.format('it')}. Listen on tls/ with "
@@ -197,6 +201,7 @@ class AgentOptions:
         certs: folder with the authority's certificate and this agent's, which a `tls/` endpoint needs.
         join_timeout: seconds to wait for the world, at the start and when it has been lost.
         lease: a link that is silent for that many seconds counts as dead.
+        faults: what happens to its messages, see `Faults`.
     """
 
     agent: int
@@ -206,10 +211,12 @@ class AgentOptions:
     certs: str = ""
     join_timeout: float = 60.0
     lease: float = 1.0
+    faults: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Refuse what cannot be run."""
         run_prefix(self.run)
+        Faults.of(self.faults)
         _require_positive(self, "join_timeout", "lease")
         if self.agent < 0:
             raise InvalidOptionError(f"agent: expected an index >= 0, got {self.agent}")

@@ -54,6 +54,9 @@ class Plant(Protocol):
     def apply(self, choices: Sequence[Choice]) -> list[Commit]:
         """Carry out what the agents chose, in this order, and go on until somebody is to decide again."""
 
+    def objectives(self) -> dict[str, float]:
+        """The objectives so far, by name."""
+
     def summary(self) -> dict[str, Any]:
         """The plant's part of the report."""
 
@@ -107,9 +110,13 @@ class SimulatedPlant:
             share=float(observation[VISIBLE_SHARE][0]),
         )
 
+    def objectives(self) -> dict[str, float]:
+        """See Plant.objectives."""
+        return {name: float(values[0]) for name, values in self.simulator.objectives().items()}
+
     def summary(self) -> dict[str, Any]:
         """See Plant.summary: simulated time, objectives, and their series."""
-        objectives = {name: float(values[0]) for name, values in self.simulator.objectives().items()}
+        objectives = self.objectives()
         series = self.telemetry.series(self.simulator)
         figures = {name: values[0].tolist() for name, values in self.simulator.agent_figures().items()}
         return {"time": int(self.simulator.time[0]), "objectives": objectives, "agent_figures": figures, **series}

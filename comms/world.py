@@ -20,6 +20,7 @@ from marl_sched.comms.decision_log import SCHEMA, CommitLog, FileLog, Header, Me
 from marl_sched.comms.metrics.report import build_report
 from marl_sched.comms.metrics.run_metrics import RunMetrics
 from marl_sched.comms.metrics.throttle import ThrottledLog
+from marl_sched.comms.observation import Observation
 from marl_sched.comms.options import WorldOptions
 from marl_sched.comms.plant import Plant
 from marl_sched.comms.process import interruptible, run_process
@@ -28,6 +29,7 @@ from marl_sched.comms.protocol import keys
 from marl_sched.comms.protocol import messages as wire
 from marl_sched.comms.protocol.world_protocol import WorldProtocol
 from marl_sched.comms.transport.base import Transport
+from marl_sched.comms.transport.faulty import Faults, FaultyTransport
 from marl_sched.errors import DeploymentError, InvalidMessageError
 from marl_sched.files import write_json
 
@@ -98,6 +100,8 @@ class World:
         self._told: tuple[str, int] = ("", -1)
         self._tick = 0
         self._refused = refused or Refusals()
+        horizon = options.horizon or self.domain.default_horizon
+        self._observation = Observation(self.domain.agent_prefix, self.telemetry.time_unit, horizon)
 
     def run(self) -> dict[str, Any]:
         """Gather the agents, play the episode, say goodbye; the report, whatever the end.
@@ -154,6 +158,8 @@ class World:
                     payload = wire.encode(message)
                     self.metrics.note_sent(key, payload)
                     self.transport.put(key, payload, control=control)
+                    if key == keys.CLOCK:
+                        self._tell_observers()
                 case ev.Reply(query, message):
                     payload = wire.encode(message)
                     self.metrics.note_sent("world/answer", payload)
@@ -165,11 +171,28 @@ class World:
                 case ev.Count(kind, amount):
                     self.metrics.counts[kind] += amount
                 case ev.Warn(kind, text):
+                    self._observation.last_error = text
                     self._warnings.warn(kind, text, self._clock())
+
+    def _tell_observers(self) -> None:
+        counts = self.metrics.counts + self.transport.dropped + self._refused.counts
+        said = self._observation.message(
+            self.options.run,
+            self.epoch,
+            tick=self._tick,
+            phase=self.protocol.phase,
+            slots=self.protocol.members.slots,
+            objectives=self.plant.objectives(),
+            counts=counts,
+            now=self._clock(),
+        )
+        self.transport.put(keys.OBSERVED, wire.encode(said))
 
     def _apply(self, choices: tuple[ev.Choice, ...]) -> None:
         commits = self.plant.apply(choices)
-        self.commits.append(Step(commits=commits))
+        self.commits.append(Step(commits=commits, sources=[choice.source for choice in choices]))
+        self._observation.note(commits)
+        self.metrics.note_applied(self._clock())
         for choice, commit in zip(choices, commits, strict=True):
             if choice.outcome == ev.Outcome.DECIDED:
                 self.metrics.latency.add(choice.latency)
@@ -189,6 +212,8 @@ class World:
             self.metrics.slept_s += note.waited
         name = "world" if note.agent < 0 else self.domain.agent_name(note.agent)
         self.metrics.note_event(self.telemetry.time_unit, self._tick, name, note.event, note.waited)
+        if note.agent >= 0 and self.protocol.phase != "gathering":
+            self._tell_observers()
         log.info("%s %d: %s %s", self.telemetry.time_unit, self._tick, name, note.event)
 
     def _tell_progress(self) -> None:
@@ -200,6 +225,8 @@ class World:
     def _report(self, ending: ev.End, seconds: float) -> dict[str, Any]:
         self.metrics.counts.update(self.transport.dropped)
         self.metrics.counts.update(self._refused.counts)
+        if isinstance(self.transport, FaultyTransport):
+            self.metrics.injected.update(self.transport.injected)
         report = build_report(
             self.options,
             ending=ending,
@@ -231,7 +258,7 @@ def serve(options: WorldOptions, progress: Progress | None = None) -> dict[str, 
         commits = FileLog(Path(options.log), header, options.sync)
     identity, plant, refused = options.identity(), options.plant(), Refusals()
     with counted_refusals(refused.count, refused.tell):
-        transport = hub(
+        transport: Transport = hub(
             options.run,
             settle_port(options.listen),
             options.domain().agent_prefix,
@@ -239,6 +266,8 @@ def serve(options: WorldOptions, progress: Progress | None = None) -> dict[str, 
             identity=identity,
             channels=plant.channels,
         )
+        if options.faults:
+            transport = FaultyTransport(transport, Faults.of(options.faults), 0)
         try:
             world = World(options, transport, plant=plant, commits=commits, progress=progress, refused=refused)
             with interruptible(transport):

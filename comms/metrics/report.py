@@ -94,6 +94,7 @@ def build_report(
         "messages": metrics.messages(),
         "latency_ms": metrics.latency_ms(),
         **{name: metrics.counts[name] for name in COUNTS},
+        "injected": dict(metrics.injected),
         "deaths": [event for event in metrics.events if event["event"] in LOSSES],
         "events": metrics.events,
         "events_not_kept": metrics.counts["events_not_kept"],
@@ -104,6 +105,7 @@ def build_report(
         # incarnations together.
         "delay_bound_s": round(options.deadline * max_misses(options.patience), 6),
         "standstill_s": round(metrics.standstill_s, 3),
+        "longest_pause_s": round(metrics.longest_pause_s, 3),
         "slept_s": round(metrics.slept_s, 3),
         "seconds": round(seconds, 3),
     }

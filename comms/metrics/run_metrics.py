@@ -31,11 +31,20 @@ class RunMetrics:
     turns: int = 0
     standstill_s: float = 0.0
     slept_s: float = 0.0
+    longest_pause_s: float = 0.0  # between two decisions that were applied
+    applied_at: float | None = None
     sent: Counter[str] = field(default_factory=Counter)
     sent_bytes: Counter[str] = field(default_factory=Counter)
     heard: Counter[str] = field(default_factory=Counter)
     heard_bytes: Counter[str] = field(default_factory=Counter)
     counts: Counter[str] = field(default_factory=Counter)
+    injected: Counter[str] = field(default_factory=Counter)  # faults of the world's own messages, by kind
+
+    def note_applied(self, now: float) -> None:
+        """Note that decisions were applied."""
+        if self.applied_at is not None:
+            self.longest_pause_s = max(self.longest_pause_s, now - self.applied_at)
+        self.applied_at = now
 
     def note_sent(self, key: str, payload: bytes) -> None:
         """Count a message of the world."""

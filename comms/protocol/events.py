@@ -169,6 +169,7 @@ class Choice:
     action: int
     outcome: Outcome
     latency: float = 0.0  # seconds from the turn to the decision
+    source: str = ""  # `incarnation/sequence` of the decision, which no other decision has
 
 
 @dataclass(frozen=True, slots=True)

@@ -150,6 +150,45 @@ class Decision(Message, tag="decision.2", frozen=True):
         return mine == (turn.epoch, turn.tick, turn.agent, turn.incarnation, turn.sequence)
 
 
+class Seen(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """An agent as the world sees it: its slot's state, and for how many seconds it has been silent."""
+
+    name: Word
+    state: Word
+    policy: Annotated[str, msgspec.Meta(max_length=200)]
+    turns: Natural
+    losses: Natural
+    silent: float
+
+
+class Decided(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """What became of a turn: tick, agent, action and outcome."""
+
+    tick: Natural
+    agent: Natural
+    action: Natural
+    outcome: Word
+
+
+class Observed(Message, tag="observed.1", frozen=True):
+    """What observers are told, at every change of the phase or of an agent and once a heartbeat.
+
+    `decisions` counts those of this epoch of the world; `decided` has those since the last message, the newest of them
+    if there were very many.
+    """
+
+    tick: Natural
+    horizon: Natural
+    phase: Phase
+    unit: Word
+    agents: list[Seen]
+    decisions: Natural
+    decided: list[Decided]
+    objectives: dict[Word, float]
+    counts: Counts
+    last_error: Sentence
+
+
 ToAgent = Turn | Welcome | Fenced | Refused
 FromAgent = Hello | Beat | Goodbye
 

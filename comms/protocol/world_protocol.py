@@ -340,7 +340,8 @@ class WorldProtocol:
         if slot.state == SlotState.READY:
             slot.move(SlotEvent.ASK)
         self.members.answered(said.agent)
-        self._choices[said.agent] = ev.Choice(said.agent, said.action, ev.Outcome.DECIDED, now - turn.asked_at)
+        source = f"{said.incarnation}/{said.sequence}"
+        self._choices[said.agent] = ev.Choice(said.agent, said.action, ev.Outcome.DECIDED, now - turn.asked_at, source)
 
     def _part(self, goodbye: wire.Goodbye, now: float, out: list[ev.Effect]) -> None:
         slot = self.members.slots[goodbye.agent]

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import logging
 import re
 import socket
 import threading
@@ -33,12 +34,14 @@ from marl_sched.comms.transport.endpoints import check_endpoint, is_encrypted
 from marl_sched.comms.transport.inbox import Inbox
 from marl_sched.errors import DeploymentError, InvalidOptionError
 
+log = logging.getLogger(__name__)
 DEFAULT_LEASE = 1.0  # seconds of silence after which a link counts as dead
 QUEUE = 16  # batches that may wait on a link, the most that Zenoh takes
 DROP_AFTER_US = 2000  # for which a full link may hold up a message before it is dropped
 CONNECT_SLICE = 1.0  # seconds for which an attempt to connect may keep a process from hearing signals
 MAX_QUERIES, MAX_ALIKE = 256, 4  # that wait for an answer, in all and by one key; more are dropped
 QUERY_TIMEOUT = 10.0
+CLOSE_S = 1.0  # for which a session may take to close
 ACCEPT_MS = 2000  # for which a connection may be half open
 
 
@@ -147,10 +150,20 @@ class ZenohTransport:
     def close(self) -> None:
         """See Transport.close."""
         self._tokens, self._subscribers = {}, {}
-        self._session.close()
+        closing = threading.Thread(target=_close, args=(self._session,), daemon=True)
+        closing.start()
+        closing.join(CLOSE_S)
 
     def _local(self, key: Any) -> str:
         return str(key).removeprefix(self._prefix)
+
+
+def _close(session: zenoh.Session) -> None:
+    """Close a session. Zenoh waits 10 s for a peer that is frozen, and nobody waits for that."""
+    try:
+        session.close()
+    except zenoh.ZError as error:
+        log.warning("the session did not close: %s", _plain(error))
 
 
 def hub(

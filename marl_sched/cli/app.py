@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from marl_sched.cli import bound, demo, deployment, evaluation, information, pages, problems, sheets, training
+from marl_sched.cli import bound, chaos, demo, deployment, evaluation, information, pages, problems, sheets, training
 from marl_sched.errors import InvalidSheetError, MarlSchedError
 
 app = typer.Typer(
@@ -22,7 +22,7 @@ app = typer.Typer(
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
 )
-for group in (problems, sheets, evaluation, pages, bound, training, deployment, demo, information):
+for group in (problems, sheets, evaluation, pages, bound, training, deployment, chaos, demo, information):
     group.add_to(app)
 
 # Newer typer ships click inside itself, older ones depend on it: the base of all its errors of usage is reached

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import os
-import re
 import signal
 import socket
 import subprocess
@@ -17,9 +16,10 @@ from typing import Any
 
 import pytest
 
+from marl_sched.comms.chaos.stops import processes_of, takes_signals
 from marl_sched.comms.launcher import Deployment, deploy
 from marl_sched.comms.options import DeployOptions, WorldOptions
-from marl_sched.comms.process import SIGNALS, print_progress
+from marl_sched.comms.process import print_progress
 from marl_sched.errors import DeploymentError, UnknownNameError
 
 LOCAL = {"view": "local", "view_options": {"reach": 1, "comm": 1, "staleness": 12}}
@@ -36,31 +36,11 @@ def world(**changes) -> WorldOptions:
     return WorldOptions(**{**defaults, **changes})
 
 
-def processes_of(run: str) -> list[int]:
-    """Processes whose command line names the run: the fork server's name is that of all that were forked from it."""
-    found = []
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit() and int(entry.name) != os.getpid():
-            try:
-                command = (entry / "cmdline").read_bytes()
-            except OSError:  # it has just ended
-                continue
-            if run.encode() in command:
-                found.append(int(entry.name))
-    return found
-
-
 def wait_until(condition, seconds: float = 240.0) -> None:
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, f"still not so after {seconds:g} s"
         time.sleep(0.05)
-
-
-def catches(pid: int, numbers: tuple[signal.Signals, ...]) -> bool:
-    """Whether a process has a handler for each of these signals."""
-    (mask,) = re.findall(r"^SigCgt:\s*([0-9a-f]+)$", Path(f"/proc/{pid}/status").read_text(), re.MULTILINE)
-    return all(int(mask, 16) >> (number - 1) & 1 for number in numbers)
 
 
 def run_module(name: str, options: dict, timeout: float = 120.0) -> subprocess.CompletedProcess[str]:
@@ -228,7 +208,7 @@ def test_launcher_that_is_ended_leaves_a_report_and_no_process_or_folder(tmp_pat
         while line != f"{at}\n":
             line = launcher.stdout.readline()
             assert line, launcher.stderr.read()
-        wait_until(lambda: catches(launcher.pid, SIGNALS))  # they are its first act; a signal before them is Python's
+        wait_until(lambda: takes_signals(launcher.pid))  # they are its first act; a signal before them is Python's
         launcher.send_signal(number)
         _, errors = launcher.communicate(timeout=120)
         wait_until(lambda: processes_of(given.run) == [], 60)

@@ -35,7 +35,7 @@ def test_run_begins_with_the_last_hello_by_a_welcome_and_the_first_turn():
 def test_decision_is_applied_and_the_next_agent_asked_at_once():
     world, turn = running()
     effects = world.decide(1.25, turn, action=7)
-    assert of(effects, ev.Apply) == [ev.Apply((ev.Choice(0, 7, ev.Outcome.DECIDED, 0.25),))]
+    assert of(effects, ev.Apply) == [ev.Apply((ev.Choice(0, 7, ev.Outcome.DECIDED, 0.25, "a/1"),))]
     assert [t.agent for t in turns(effects)] == [1]
     assert [n.sequence for n in said(effects, wire.News)] == [2, 2]
 
@@ -140,7 +140,7 @@ def test_09_killed_agent_is_waited_for_in_lockstep_and_its_successor_takes_the_t
     assert ev.Note(-1, "running", pytest.approx(4.9)) in effects
     assert world.decide(6.45, turn) == [ev.Count("stale")]  # of the one that is dead
     world.decide(6.5, again, action=3)
-    assert world.applied == [ev.Choice(0, 3, ev.Outcome.DECIDED, pytest.approx(0.1))]
+    assert world.applied == [ev.Choice(0, 3, ev.Outcome.DECIDED, pytest.approx(0.1), "b/2")]
     assert world.slot(0).losses == 0
 
 
