@@ -7,13 +7,14 @@
     train(load_config(["view=local"]), callbacks=[Print()])
 
 Every hook does nothing unless a subclass says otherwise. The run's own log (marl_sched.train.logging) is a callback,
-and `LoggerCallback` hands every number to one of TorchRL's loggers.
+and so is `LoggerCallback`, which hands every number to one of TorchRL's loggers (`logger=wandb`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -64,24 +65,46 @@ class Callback:
 
 
 class LoggerCallback(Callback):
-    """Every number of a run to one of TorchRL's loggers: csv, mlflow, tensorboard, trackio or wandb.
+    """Every number of a run to one of TorchRL's loggers, by its word in the configuration.
+
+    `tensorboard` and `csv` write into folders of these names in the run's folder, `mlflow` likewise, `wandb` and
+    `trackio` under the name of the run's folder to where they are told to (their own settings).
 
     Args:
-        name: which; its package must be installed, MarlSchedError says so otherwise.
+        name: which. Raises MarlSchedError, with the extra that brings it, where its package is not installed.
     """
 
     def __init__(self, name: LoggerName) -> None:
+        if name != "csv" and find_spec(name) is None:
+            extra = "train" if name == "tensorboard" else name
+            raise MarlSchedError(f"logger={name}: {name} is not installed: pip install 'marl-sched[{extra}]'")
         self._name = name
 
     def on_start(self, run: Run) -> None:
-        """Open the logger, in the run's folder where it writes files."""
-        try:
-            self._logger = get_logger(self._name, str(run.directory / "loggers"), run.directory.name or "run")
-        except ImportError as error:
-            raise MarlSchedError(f"logger={self._name}: expected its package to be installed ({error})") from error
+        """Open the logger; where TensorBoard goes on, points after the last checkpoint are dropped."""
+        in_folder = self._name in ("csv", "tensorboard")
+        folder, experiment = (run.directory, self._name) if in_folder else (run.directory / self._name, run.directory)
+        self._logger = get_logger(self._name, str(folder), Path(experiment).name or "run")
+        if self._name == "tensorboard" and run.counters.update:
+            self._drop_later(run.counters.update + 1)
+
+    def _drop_later(self, step: int) -> None:
+        from tensorboard.compat.proto.event_pb2 import Event, SessionLog  # type: ignore[import-untyped]
+
+        writer = self._logger.experiment.file_writer  # type: ignore[union-attr]  # TensorBoard's own
+        writer.add_event(Event(step=step, file_version="brain.Event:2"))
+        writer.add_event(Event(step=step, session_log=SessionLog(status=SessionLog.START)))
 
     def on_update(self, run: Run, values: Mapping[str, float]) -> None:
         """Log every number at the update's step."""
-        if self._logger is not None:
-            for name, value in values.items():
-                self._logger.log_scalar(name, float(value), step=int(values["update"]))
+        for name, value in values.items():
+            if name != "update":
+                self._logger.log_scalar(name, float(value), step=int(values["update"]))  # type: ignore[union-attr]
+
+    def on_end(self, run: Run) -> None:
+        """Close what has to be closed, so that every number is kept."""
+        experiment = getattr(self._logger, "experiment", None)
+        for close in ("close", "finish"):  # TensorBoard's and W&B's words
+            if hasattr(experiment, close):
+                getattr(experiment, close)()
+                return

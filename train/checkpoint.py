@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -33,14 +33,14 @@ class Counters:
     Attributes:
         update: updates done.
         seconds: wall time of all updates.
-        hours: simulated time over all rows.
+        time: simulated time over all rows.
         decisions: turns taken.
         best: the best validation score so far, None before the first.
     """
 
     update: int = 0
     seconds: float = 0.0
-    hours: int = 0
+    time: int = 0
     decisions: int = 0
     best: float | None = None
 
@@ -51,7 +51,7 @@ class Numbers(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     tensors: str
     counters: Counters
     learner: dict[str, float | None]
-    schema: Literal[2] = 2
+    schema: Literal[3] = 3  # 2 called the counter of simulated time `hours`
 
 
 def save_checkpoint(
@@ -83,7 +83,7 @@ def load_checkpoint(
     Raises InvalidFileError for a file that is missing, damaged or of another network.
     """
     try:
-        numbers = msgspec.convert(read_json(directory / NAME), Numbers)
+        numbers = msgspec.convert(_of_schema_3(read_json(directory / NAME)), Numbers)
     except msgspec.ValidationError as error:
         raise InvalidFileError(directory / NAME, "", f"a training checkpoint: {error}") from error
     path = directory / numbers.tensors
@@ -102,6 +102,14 @@ def load_checkpoint(
             tensor.copy_(saved[name])
     learner.restore(numbers.learner)
     return numbers.counters, {name: saved[_COLLECTOR + name].numpy() for name in expected}
+
+
+def _of_schema_3(content: Any) -> Any:
+    """What a checkpoint file holds, brought from schema 2 to 3."""
+    if not isinstance(content, dict) or content.get("schema") != 2 or not isinstance(content.get("counters"), dict):
+        return content
+    counters = {{"hours": "time"}.get(name, name): value for name, value in content["counters"].items()}
+    return {**content, "schema": 3, "counters": counters}
 
 
 def _learned(learner: Learner) -> dict[str, Tensor]:

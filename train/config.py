@@ -91,7 +91,8 @@ class CollectorConfig(Group, frozen=True, kw_only=True):
 class TrainConfig(Group, frozen=True, kw_only=True):
     """A whole run; `configs/train.yaml`. `start_from`: a policy, by name or path, to go on from.
 
-    `device`: where networks learn (marl_sched.train.device), `logger`: one more place for the log's numbers.
+    `device`: where networks learn (marl_sched.train.device), `logger`: where the log's numbers go
+    beside `progress.csv`.
     """
 
     env: EnvConfig

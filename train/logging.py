@@ -1,4 +1,4 @@
-"""What a run tells while it goes on: a progress bar with the current M1, `progress.csv`, and TensorBoard events."""
+"""What a run tells while it goes on: a progress bar with the current M1, and `progress.csv`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from pathlib import Path
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from torch.utils.tensorboard import SummaryWriter
 
 from marl_sched.files import replacing
 from marl_sched.train.callbacks import Callback, Run
@@ -16,7 +15,7 @@ from marl_sched.train.device import described, device_of
 
 
 class RunLog(Callback):
-    """The run's own log: `progress.csv`, whose columns are what was logged, and `tensorboard/`.
+    """The run's own log: `progress.csv`, whose columns are what was logged.
 
     Rows of updates that a run did after its last checkpoint are dropped when it goes on.
 
@@ -38,7 +37,6 @@ class RunLog(Callback):
     def on_start(self, run: Run) -> None:
         """Open the table and show the bar."""
         self._path, start = run.directory / "progress.csv", run.counters.update
-        self._writer = SummaryWriter(str(run.directory / "tensorboard"), purge_step=start + 1)
         rows = read_progress(self._path) if start > 0 else []
         self._rows: list[Mapping[str, str]] = [row for row in rows if int(row["update"]) <= start]
         self._columns = list(rows[0]) if rows else []
@@ -49,9 +47,8 @@ class RunLog(Callback):
         self._bar.start()
 
     def on_end(self, run: Run) -> None:
-        """Close everything."""
+        """Take the bar away."""
         self._bar.stop()
-        self._writer.close()
 
     def on_update(self, run: Run, values: Mapping[str, float]) -> None:
         """One row; `values["update"]` is the number of updates done."""
@@ -64,9 +61,6 @@ class RunLog(Callback):
         else:
             with self._path.open("a", newline="", encoding="utf-8") as file:
                 csv.DictWriter(file, self._columns).writerow(self._rows[-1])
-        for name, value in values.items():
-            if name != "update":
-                self._writer.add_scalar(name, value, done)
         self._validation = values.get("validation", self._validation)
         self._best = values.get("best", self._best)
         text = f"M1 sampled {values['reward_rate']:.3f}, validated {self._validation:.4f}, best {self._best:.4f}"

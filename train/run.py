@@ -40,6 +40,7 @@ def train(
     """
     directory = Path(config.directory())
     _require_no_run(directory)
+    callbacks = [*_own(config, quiet=quiet), *callbacks]
     record = RunRecord(config=config, overrides=list(overrides), revision=source_revision())
     parts, counters = build(record), Counters()  # before the folder, so that what cannot be trained leaves none
     if config.start_from is not None:
@@ -48,7 +49,7 @@ def train(
         _require_no_run(directory)  # another process may have begun one by now
         parts.save(counters, directory)  # first, so that whatever holds a run can be resumed
         write_json(directory / CONFIG, msgspec.to_builtins(parts.record))
-        return _loop(parts, counters, directory, callbacks, quiet=quiet)
+        return _loop(parts, counters, directory, callbacks)
 
 
 def _require_no_run(directory: Path) -> None:
@@ -81,10 +82,16 @@ def resume(run_dir: str | Path, callbacks: Sequence[Callback] = (), *, quiet: bo
             write_json(directory / CONFIG, msgspec.to_builtins(record))
             warnings.warn(f"{directory}: goes on with another source than before: {record.source}", stacklevel=2)
         parts = build(record)
-        return _loop(parts, parts.restore(directory), directory, callbacks, quiet=quiet)
+        callbacks = [*_own(record.config, quiet=quiet), *callbacks]
+        return _loop(parts, parts.restore(directory), directory, callbacks)
 
 
-def _loop(parts: Parts, counters: Counters, directory: Path, callbacks: Sequence[Callback], *, quiet: bool) -> Path:
+def _own(config: TrainConfig, *, quiet: bool) -> list[Callback]:
+    """The run's own callbacks; MarlSchedError for a logger whose package is not installed."""
+    return [RunLog(quiet=quiet), *([] if config.logger is None else [LoggerCallback(config.logger)])]
+
+
+def _loop(parts: Parts, counters: Counters, directory: Path, callbacks: Sequence[Callback]) -> Path:
     """The loop. Everything random in an update is a function of (seed, update, instance number).
 
     The first SIGINT or SIGTERM ends it after the running update, with a checkpoint.
@@ -92,8 +99,7 @@ def _loop(parts: Parts, counters: Counters, directory: Path, callbacks: Sequence
     config, run = parts.record.config, Run(parts, counters, directory)
     torch.set_num_threads(config.threads)
     keep_freed_memory()
-    own = [RunLog(quiet=quiet), *([] if config.logger is None else [LoggerCallback(config.logger)])]
-    with stopping() as stop, _called([*own, *callbacks], run) as everyone:
+    with stopping() as stop, _called(callbacks, run) as everyone:
         while counters.update < config.updates and not stop.requested:
             started = time.perf_counter()
             update = counters.update
@@ -103,7 +109,7 @@ def _loop(parts: Parts, counters: Counters, directory: Path, callbacks: Sequence
             rng = np.random.default_rng([config.seed, update, _SAMPLES])
             report = parts.learner.learn(rollout, update / config.updates, rng)
             counters.update += 1
-            counters.hours += rollout.time
+            counters.time += rollout.time
             counters.decisions += rollout.decisions
             scores = parts.validate(counters, directory)
             counters.seconds += time.perf_counter() - started

@@ -14,7 +14,7 @@ from marl_sched.agents.policies.cards import read_card, source_revision
 from marl_sched.agents.policies.network_policy import NetworkPolicy
 from marl_sched.agents.registry import create_scheduler
 from marl_sched.domain import get_domain
-from marl_sched.errors import InvalidFileError, InvalidOptionError
+from marl_sched.errors import InvalidFileError, InvalidOptionError, MarlSchedError
 from marl_sched.files import read_json, write_json
 from marl_sched.train.callbacks import Callback, Run
 from marl_sched.train.checkpoint import Counters
@@ -302,4 +302,15 @@ def test_the_logs_columns_are_what_was_logged_and_a_logger_is_a_word(tmp_path: P
     columns = rows(directory)[0].keys()
     assert "kl" in columns
     assert "regret" not in columns
-    assert list((directory / "loggers").rglob("reward_rate.csv"))
+    assert list((directory / "csv").rglob("reward_rate.csv"))
+
+
+def test_a_logger_that_is_not_installed_is_named_with_its_extra_before_anything_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("marl_sched.train.callbacks.find_spec", lambda name: None)
+    with pytest.raises(
+        MarlSchedError, match=r"logger=wandb: wandb is not installed: pip install 'marl-sched\[wandb\]'"
+    ):
+        train_from_overrides([*STEP_BASELINE, "logger=wandb", f"run_dir={tmp_path / 'run'}"], quiet=True)
+    assert not (tmp_path / "run").exists()
