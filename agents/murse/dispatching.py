@@ -27,12 +27,17 @@ from typing import NamedTuple
 import numpy as np
 
 from marl_sched.agents.murse.following import PlanningScheduler
-from marl_sched.agents.murse.latest_start import common_horizon, latest_starts, shortest_durations, successors
-from marl_sched.agents.murse.problem import Plan, Round
+from marl_sched.agents.murse.latest_start import (
+    common_horizon,
+    latest_starts,
+    release_others,
+    shortest_durations,
+    successors,
+)
+from marl_sched.agents.murse.problem import Begun, Plan, Round
 from marl_sched.agents.murse.snapshot import as_expected, estimated_round, remaining_round
 from marl_sched.envs.murse.instance import NO_DEADLINE
 from marl_sched.envs.murse.simulator import MurseSimulator
-from marl_sched.envs.murse.timetable import deadlines_hold
 from marl_sched.errors import require
 from marl_sched.kernels import kernel
 
@@ -169,11 +174,12 @@ def dispatch_rule(
     n, m = durations.shape
     first, waiting, times = waits
     ahead, release, done = np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n, np.bool_)
+    changed = np.zeros(n, np.bool_)
     for k in range(first[n]):
         ahead[waiting[k]] += 1
     for k in range(count):
         done[order[k]] = True
-        _release(order[k], finish[order[k]], first, waiting, times, near, ahead, release)
+        release_others(order[k], finish[order[k]], first, waiting, times, near, ahead, release, changed)
     open_ = np.empty(n, np.int64)
     startable = np.flatnonzero(~done & (ahead == 0))
     n_open = len(startable)
@@ -196,33 +202,13 @@ def dispatch_rule(
         order[count], doers[task] = task, agent
         count += 1
         finish[task] = free_at[agent] = clock + durations[task, agent]
-        _release(task, finish[task], first, waiting, times, near, ahead, release)
+        release_others(task, finish[task], first, waiting, times, near, ahead, release, changed)
         for k in range(first[task], first[task + 1]):
             if ahead[waiting[k]] == 0:
                 open_[n_open] = waiting[k]
                 n_open += 1
         agent = 0 if durations[task, agent] == 0 else agent + 1  # nothing may have passed: everybody looks again
     return count
-
-
-@kernel
-def _release(
-    task: int,
-    end: int,
-    first: np.ndarray,
-    tasks: np.ndarray,
-    lags: np.ndarray,
-    near: np.ndarray,
-    ahead: np.ndarray,
-    release: np.ndarray,
-) -> None:
-    """Note for all others that `task` has been dispatched and ends at `end`."""
-    for k in range(first[task], first[task + 1]):
-        ahead[tasks[k]] -= 1
-        release[tasks[k]] = max(release[tasks[k]], end + lags[k])
-    for other in range(len(near)):
-        if near[task, other]:
-            release[other] = max(release[other], end)
 
 
 @kernel
@@ -240,27 +226,12 @@ def _next_time(clock: int, free_at: np.ndarray, open_: np.ndarray, n_open: int, 
 
 def dispatched(problem: Round, rule: str) -> Plan:
     """The schedule of a rule of PRIORITY_RULES behind what is committed to; UnknownNameError for another name."""
-    urgency = urgency_of(problem, rule)
-    n = problem.n_tasks
-    committed = np.flatnonzero(problem.fixed >= 0)
-    committed = committed[np.argsort(problem.fixed[committed], kind="stable")]
-    order, doers, finish = np.zeros(n, np.int64), problem.agents.copy(), np.zeros(n, np.int64)
-    order[: len(committed)] = committed
-    finish[committed] = problem.fixed[committed] + problem.durations[committed, doers[committed]]
+    urgency, begun = urgency_of(problem, rule), Begun.of(problem)
     count = dispatch_rule(
-        urgency, problem.durations, successors(problem.lags), problem.near, problem.ready.copy(), order,
-        len(committed), doers, finish,
+        urgency, problem.durations, successors(problem.lags), problem.near, begun.free_at, begun.order, begun.count,
+        begun.doers, begun.finish,
     )  # fmt: skip
-    tasks, starts = order[:count], np.zeros(n, np.int64)
-    starts[tasks] = finish[tasks] - problem.durations[tasks, doers[tasks]]
-    return Plan(
-        tasks=tasks,
-        agents=doers[tasks],
-        starts=starts,
-        finishes=finish,
-        makespan=int(finish.max()),
-        feasible=count == n and bool(deadlines_hold(tasks, finish, problem.deadlines)),
-    )
+    return begun.plan(problem, count)
 
 
 class DispatchingRule(PlanningScheduler):

@@ -6,12 +6,13 @@ from abc import abstractmethod
 
 import numpy as np
 
-from marl_sched.agents.base import EpochPlayer, PrivilegedInfo, Scheduler
+from marl_sched.agents.base import EpochPlayer, Scheduler
 from marl_sched.agents.murse.problem import Plan
 from marl_sched.agents.murse.snapshot import as_murse
 from marl_sched.agents.murse.whole_rounds import round_player
 from marl_sched.envs.murse.simulator import MurseSimulator
 from marl_sched.envs.murse.state import NOBODY
+from marl_sched.privileged import PrivilegedInfo
 from marl_sched.simulation import TurnSimulator
 
 

@@ -157,7 +157,7 @@ def complete(
     best, begin, end = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
     for k in range(count):
         done[order[k]] = True
-        _release(order[k], finish[order[k]], first, tasks, lags, near, ahead, release, fresh)
+        release_others(order[k], finish[order[k]], first, tasks, lags, near, ahead, release, fresh)
     while count < n:
         least = _UNREACHED
         for task in range(n):
@@ -183,12 +183,12 @@ def complete(
         for task in range(n):
             if best[task] == agent:
                 fresh[task] = True
-        _release(chosen, end[chosen], first, tasks, lags, near, ahead, release, fresh)
+        release_others(chosen, end[chosen], first, tasks, lags, near, ahead, release, fresh)
     return count
 
 
 @kernel
-def _release(
+def release_others(
     task: int,
     end: int,
     first: np.ndarray,
@@ -199,7 +199,11 @@ def _release(
     release: np.ndarray,
     fresh: np.ndarray,
 ) -> None:
-    """Note for all others that `task` has been dispatched and ends at `end`."""
+    """Note for all others that `task` has been dispatched and ends at `end`.
+
+    first, tasks and lags are what `successors` returns; ahead int64 (N,), the tasks still to be dispatched before each,
+    and release int64 (N,), its least start, are written; `fresh`, bool (N,), marks those for which something changed.
+    """
     for k in range(first[task], first[task + 1]):
         other = tasks[k]
         ahead[other] -= 1

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from marl_sched.agents.murse.problem import Plan, Round
+from marl_sched.agents.murse.problem import Begun, Plan, Round
 from marl_sched.envs.murse.instance import NO_DEADLINE
 from marl_sched.envs.murse.rules import FIRST, LEAST_LEFT, MEAN_ALL, PICKING
 from marl_sched.envs.murse.state import NEVER, NOBODY, NOT_WAITING
-from marl_sched.envs.murse.timetable import deadlines_hold, earliest_start, waits_heeded
+from marl_sched.envs.murse.timetable import earliest_start, waits_heeded
 from marl_sched.errors import require
 from marl_sched.kernels import kernel
 
@@ -132,26 +132,12 @@ def list_schedule(problem: Round, priority: np.ndarray, picking: str = "first") 
     n, m = problem.n_tasks, problem.n_agents
     code = PICKING.index(require("picking strategy", picking, PICKING))
     values = np.broadcast_to(priority[:, None] if priority.ndim == 1 else priority, (n, m)).astype(np.float64)
-    committed = np.flatnonzero(problem.fixed >= 0)
-    committed = committed[np.argsort(problem.fixed[committed], kind="stable")]
-    order, doers, finish = np.zeros(n, np.int64), problem.agents.copy(), np.zeros(n, np.int64)
-    order[: len(committed)] = committed
-    finish[committed] = problem.fixed[committed] + problem.durations[committed, doers[committed]]
+    begun = Begun.of(problem)
     count = dispatch_all(
-        problem.durations, problem.lags, problem.near, values, code, problem.ready.copy(), order, len(committed),
-        doers, finish,
+        problem.durations, problem.lags, problem.near, values, code, begun.free_at, begun.order, begun.count,
+        begun.doers, begun.finish,
     )  # fmt: skip
-    tasks = order[:count]
-    starts = np.zeros(n, np.int64)
-    starts[tasks] = finish[tasks] - problem.durations[tasks, doers[tasks]]
-    return Plan(
-        tasks=tasks,
-        agents=doers[tasks],
-        starts=starts,
-        finishes=finish,
-        makespan=int(finish.max()),
-        feasible=count == n and bool(deadlines_hold(tasks, finish, problem.deadlines)),
-    )
+    return begun.plan(problem, count)
 
 
 def edf_priority(deadlines: np.ndarray) -> np.ndarray:

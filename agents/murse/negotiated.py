@@ -6,7 +6,7 @@ from abc import abstractmethod
 
 import numpy as np
 
-from marl_sched.agents.base import PrivilegedInfo, Scheduler
+from marl_sched.agents.base import Scheduler
 from marl_sched.agents.murse.auctions.agent_schedule import UNKNOWN, AgentSchedule
 from marl_sched.agents.murse.auctions.cbba import CbbaBidder
 from marl_sched.agents.murse.auctions.network import Bidder, hearing, negotiate
@@ -18,6 +18,7 @@ from marl_sched.agents.murse.windows import induced_deadlines
 from marl_sched.envs.murse.simulator import MurseSimulator
 from marl_sched.envs.murse.state import NOBODY
 from marl_sched.errors import InvalidOptionError
+from marl_sched.privileged import PrivilegedInfo
 from marl_sched.simulation import TurnSimulator
 
 _TURNS_PER_TASK = 100

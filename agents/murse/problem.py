@@ -95,6 +95,47 @@ class Plan:
         return float(problem.weights @ self.finishes)
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Begun:
+    """A round as far as it is committed to, in arrays that a dispatching kernel completes in place.
+
+    Attributes:
+        order: int64 (N,), dispatched tasks, of which the first `count` are committed to, by their starts.
+        count: how many are committed to.
+        doers, finish: int64 (N,), agents and finishes of dispatched tasks.
+        free_at: int64 (A,), when each agent is free.
+    """
+
+    order: np.ndarray
+    count: int
+    doers: np.ndarray
+    finish: np.ndarray
+    free_at: np.ndarray
+
+    @classmethod
+    def of(cls, problem: Round) -> Begun:
+        """What a problem is committed to; the problem's own arrays are left alone."""
+        committed = np.flatnonzero(problem.fixed >= 0)
+        committed = committed[np.argsort(problem.fixed[committed], kind="stable")]
+        order, finish, doers = np.zeros(problem.n_tasks, np.int64), np.zeros(problem.n_tasks, np.int64), problem.agents
+        order[: len(committed)] = committed
+        finish[committed] = problem.fixed[committed] + problem.durations[committed, doers[committed]]
+        return cls(order=order, count=len(committed), doers=doers.copy(), finish=finish, free_at=problem.ready.copy())
+
+    def plan(self, problem: Round, count: int) -> Plan:
+        """The plan, once `count` tasks are dispatched; feasible if those are all, and in time."""
+        tasks, starts = self.order[:count], np.zeros(problem.n_tasks, np.int64)
+        starts[tasks] = self.finish[tasks] - problem.durations[tasks, self.doers[tasks]]
+        return Plan(
+            tasks=tasks,
+            agents=self.doers[tasks],
+            starts=starts,
+            finishes=self.finish,
+            makespan=int(self.finish.max()),
+            feasible=count == problem.n_tasks and bool(deadlines_hold(tasks, self.finish, problem.deadlines)),
+        )
+
+
 def timed(problem: Round, tasks: np.ndarray, agents: np.ndarray) -> Plan:
     """The plan that dispatches these pairs, int64 (K,), in this order at the earliest times.
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from marl_sched.agents.base import CostScheduler, PrivilegedInfo, Scheduler
+from marl_sched.agents.base import CostScheduler, Scheduler
 from marl_sched.agents.murse.lst import MARGIN, require_margin
 from marl_sched.agents.murse.snapshot import as_murse
 from marl_sched.envs.murse.dynamics import IDLE_AFTER_CONFLICT
@@ -27,6 +27,7 @@ from marl_sched.envs.murse.rules import MAKESPAN, Rules
 from marl_sched.envs.murse.state import NOBODY, State
 from marl_sched.envs.murse.views import EVERYWHERE, Sight, new_sight, survey
 from marl_sched.kernels import kernel
+from marl_sched.privileged import PrivilegedInfo
 from marl_sched.simulation import TurnSimulator
 
 CHARGES = np.array([0.0, 2.0])

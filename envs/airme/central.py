@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium import spaces
 
-from marl_sched.envs.airme.dynamics import IDLE
+from marl_sched.envs.airme.state import IDLE
 
 if TYPE_CHECKING:
     from marl_sched.envs.airme.simulator import AirmeSimulator

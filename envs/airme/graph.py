@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from marl_sched.envs.airme.dynamics import UNDECIDED, Record, State
+from marl_sched.envs.airme.state import UNDECIDED, Record, State
 from marl_sched.envs.airme.views import EVERYWHERE, home_sector, ring_distance
 from marl_sched.errors import InvalidOptionError
 from marl_sched.graph import Feature, Features, GraphSpec, NodeType, Relation

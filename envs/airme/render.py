@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from marl_sched.envs.airme.dynamics import BROKEN, FLYING, GROUNDED, REPAIR
+from marl_sched.envs.airme.state import BROKEN, FLYING, GROUNDED, REPAIR
 from marl_sched.errors import InvalidOptionError
 
 if TYPE_CHECKING:
@@ -37,15 +37,18 @@ def fleet_board(simulator: AirmeSimulator, env_index: int = 0) -> str:
         simulator.n_agents[env_index],
     )
     means = simulator.objectives()
+    planes = list(enumerate(state.planes[env_index, 1 : n_planes + 1], start=1))
     head = f"hour {simulator.time[env_index]:>4}   " + "   ".join(f"{k} {v[env_index]:.3f}" for k, v in means.items())
-    cells = [_plane_cell(state.planes[env_index, slot], slot) for slot in range(1, n_planes + 1)]
+    names = [kind.name for kind in simulator.types]
+    width = max(map(len, names))
+    cells = [_plane_cell(plane, slot, names[plane["kind"]].ljust(width)) for slot, plane in planes]
     height = -(-len(cells) // _BOARD_COLUMNS)
     lines = ["   ".join(cells[i::height]) for i in range(height)]
     crews = [_crew_cell(state.crews[env_index, crew], crew) for crew in range(n_crews)]
     return "\n".join([head, *lines, "   ".join(crews)])
 
 
-def _plane_cell(plane: np.void, slot: int) -> str:
+def _plane_cell(plane: np.void, slot: int, kind: str) -> str:
     if plane["crew"] >= 0:
         what = f"repair {plane['job_done']:>2}/{plane['job_hours']:<2} by crew {plane['crew']}"
     elif plane["broken"]:
@@ -54,7 +57,7 @@ def _plane_cell(plane: np.void, slot: int) -> str:
         what = f"flying {plane['mission_done']:>2}/{plane['mission_hours']:<2}"
     else:
         what = "grounded"
-    return f"{slot:>3} type {plane['kind']} {plane['hours']:>3} h {plane['landings']:>2} ldg  {what:<23}"
+    return f"{slot:>3} {kind} {plane['hours']:>3} h {plane['landings']:>2} ldg  {what:<23}"
 
 
 def _crew_cell(crew: np.void, index: int) -> str:

@@ -11,6 +11,19 @@ from marl_sched.compiled import entry
 from marl_sched.envs.airme import dynamics, graph
 from marl_sched.envs.airme.aircraft import PUBLISHED_TYPES, AircraftType, FailureModel, failure_table
 from marl_sched.envs.airme.instance import SCALES, AirmeInstance
+from marl_sched.envs.airme.state import (
+    BEGUN,
+    CREW,
+    MISSED,
+    OBJECTIVES,
+    PLANE,
+    REPAIRED,
+    ROW,
+    SCHEMES,
+    UNDECIDED,
+    Rules,
+    State,
+)
 from marl_sched.envs.airme.views import FullView, View
 from marl_sched.errors import IllegalActionError, InvalidOptionError, require, require_integer
 from marl_sched.noise import as_seed, episode_key
@@ -71,11 +84,11 @@ class AirmeSimulator(TurnSimulator):
         self.graph = graph.graph_spec(len(self.types))
         self.arrays = self.graph.arrays({"plane": planes + 1, "crew": crews})
         self.state = _new_state(self.batch, planes, crews, horizon, self.view.memory, record_timeline)
-        self.rules = dynamics.Rules(
+        self.rules = Rules(
             usage=np.array([kind.usage for kind in self.types]),
             failure=np.zeros((len(self.types), 1, 0)),
-            objective=dynamics.OBJECTIVES.index(objective),
-            scheme=dynamics.SCHEMES.index(scheme),
+            objective=OBJECTIVES.index(objective),
+            scheme=SCHEMES.index(scheme),
             horizon=int(horizon),
             stop_share=float(stop_share or 0.0),
         )
@@ -95,8 +108,8 @@ class AirmeSimulator(TurnSimulator):
     ) -> None:
         if not instances:
             raise InvalidOptionError("instances: expected at least one")
-        require("objective of airme", objective, dynamics.OBJECTIVES)
-        require("scheme", scheme, dynamics.SCHEMES)
+        require("objective of airme", objective, OBJECTIVES)
+        require("scheme", scheme, SCHEMES)
         if pad is not None:
             require("scale of airme", pad, SCALES)
         require_integer("horizon", horizon, 1, MOST_HOURS, "hours")
@@ -168,7 +181,7 @@ class AirmeSimulator(TurnSimulator):
         for name in ("income", "hours", "landings", "broken"):
             planes[name][1 : n_planes + 1] = getattr(instance, name)
         state.crews[b] = 0
-        state.crews["choice"][b] = dynamics.UNDECIDED
+        state.crews["choice"][b] = UNDECIDED
         state.rows[b] = 0
         row = state.rows[b]
         row["n_planes"], row["n_crews"] = n_planes, n_crews
@@ -231,14 +244,14 @@ class AirmeSimulator(TurnSimulator):
         """Crews that have still to act in this hour."""
         n = self.n_agents[env_index]
         free = (self.state.crews["plane"][env_index, :n] == 0) & (
-            self.state.crews["choice"][env_index, :n] == dynamics.UNDECIDED
+            self.state.crews["choice"][env_index, :n] == UNDECIDED
         )
         return np.flatnonzero(free) if not self.over[env_index] else np.empty(0, np.int64)
 
     def objectives(self) -> dict[str, np.ndarray]:
         """Means over the hours played, float64 (B,): profit, revenue and availability (M1 at the horizon)."""
         hours = np.maximum(self.time, 1)
-        return {name: self.state.rows["sums"][:, k] / hours for k, name in enumerate(dynamics.OBJECTIVES)}
+        return {name: self.state.rows["sums"][:, k] / hours for k, name in enumerate(OBJECTIVES)}
 
     def agent_figures(self) -> dict[str, np.ndarray]:
         """What every crew did so far, float64 (B, C); see TurnSimulator.agent_figures.
@@ -249,12 +262,12 @@ class AirmeSimulator(TurnSimulator):
         there = np.arange(self.max_agents) < self.n_agents[:, None]
         hours = np.maximum(self.time, 1)[:, None]
         work = np.where(there[:, :, None], self.state.work, np.nan)
-        busy = work[:, :, dynamics.REPAIRED] / hours
+        busy = work[:, :, REPAIRED] / hours
         return {
             "utilisation": busy,
             "idle": 1.0 - busy,
-            "idle_with_work": work[:, :, dynamics.MISSED] / hours,
-            "repairs": work[:, :, dynamics.BEGUN],
+            "idle_with_work": work[:, :, MISSED] / hours,
+            "repairs": work[:, :, BEGUN],
         }
 
     def snapshot(self, env_index: int) -> dict[str, np.ndarray]:
@@ -283,26 +296,26 @@ def _are_known(instance: AirmeInstance, types: Sequence[AircraftType]) -> bool:
     return set(instance.types) <= set(types)
 
 
-def _new_state(batch: int, planes: int, crews: int, horizon: int, staleness: int, timeline: bool) -> dynamics.State:
+def _new_state(batch: int, planes: int, crews: int, horizon: int, staleness: int, timeline: bool) -> State:
     slots = planes + 1
     memory = (batch, crews, slots) if staleness else (0, 0, 0)
-    return dynamics.State(
-        rows=np.zeros(batch, dynamics.ROW),
-        planes=np.zeros((batch, slots), dynamics.PLANE),
-        crews=np.zeros((batch, crews), dynamics.CREW),
+    return State(
+        rows=np.zeros(batch, ROW),
+        planes=np.zeros((batch, slots), PLANE),
+        crews=np.zeros((batch, crews), CREW),
         series=np.zeros((batch, horizon, 3)),
         timeline=np.zeros((batch, horizon, slots) if timeline else (0, 0, 0), np.uint8),
         jobs=np.zeros((batch, horizon, crews) if timeline else (0, 0, 0), np.int32),
         work=np.zeros((batch, crews, 3), np.int64),
-        past=np.zeros((batch, staleness + 1 if staleness else 0, slots), dynamics.PLANE),
-        private_memory=np.zeros(memory, dynamics.PLANE),
+        past=np.zeros((batch, staleness + 1 if staleness else 0, slots), PLANE),
+        private_memory=np.zeros(memory, PLANE),
         private_memory_at=np.full(memory, -1, np.int64),
     )
 
 
-def example() -> tuple[dynamics.State, dynamics.Rules]:
+def example() -> tuple[State, Rules]:
     """A state and rules of the types that those of every simulator have, to compile kernels for."""
-    rules = dynamics.Rules(np.zeros(1), np.zeros((1, 1, 1)), objective=0, scheme=0, horizon=1, stop_share=0.0)
+    rules = Rules(np.zeros(1), np.zeros((1, 1, 1)), objective=0, scheme=0, horizon=1, stop_share=0.0)
     return _new_state(1, 1, 1, 1, 0, timeline=False), rules
 
 

@@ -22,8 +22,8 @@ import msgspec
 import numpy as np
 
 from marl_sched.envs.airme import graph
-from marl_sched.envs.airme.dynamics import CREW, OBJECTIVES, PLANE, ROW, State
 from marl_sched.envs.airme.simulator import AirmeSimulator
+from marl_sched.envs.airme.state import CREW, OBJECTIVES, PLANE, ROW, State
 from marl_sched.envs.airme.views import EVERYWHERE, ring_distance
 from marl_sched.errors import InvalidMessageError
 from marl_sched.simulation import Observation

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from marl_sched.envs.airme.dynamics import Stream
+from marl_sched.envs.airme.state import Stream
 from marl_sched.errors import InvalidOptionError, require_integer
 from marl_sched.kernels import kernel
 from marl_sched.noise import integer, time_key, uniform

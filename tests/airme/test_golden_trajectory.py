@@ -34,8 +34,8 @@ import numpy as np
 import pytest
 
 from marl_sched import noise
-from marl_sched.envs.airme.dynamics import BROKEN, FLYING, GROUNDED, REPAIR
 from marl_sched.envs.airme.simulator import AirmeSimulator
+from marl_sched.envs.airme.state import BROKEN, FLYING, GROUNDED, REPAIR
 from tests.airme.fleets import STEADY, aircraft, fleet, plane
 
 FRAGILE = aircraft("fragile", usage=1.0, fails_at_hours=9)

@@ -27,16 +27,15 @@ def simulator() -> AirmeSimulator:
 
 
 def test_board_tells_of_every_plane_and_crew(simulator: AirmeSimulator) -> None:
-    # Types are numbered by their names: 0 is "reserve", 1 "steady".
     board = fleet_board(simulator)
     flying, repair = plane(simulator, 1), plane(simulator, 3)
     cells = [" ".join(cell.split()) for line in board.splitlines()[1:] for cell in line.split("   ") if cell.strip()]
     text = " ".join(board.split())
     assert "hour 2 profit" in text
-    assert f"1 type 1 33 h 7 ldg flying 2/{flying['mission_hours']}" in text
-    assert "2 type 0 2 h 0 ldg BROKEN" in text
-    assert f"3 type 0 30 h 12 ldg repair 2/{repair['job_hours']} by crew 0" in text
-    assert "4 type 0 5 h 1 ldg grounded" in text
+    assert f"1 steady 33 h 7 ldg flying 2/{flying['mission_hours']}" in text
+    assert "2 reserve 2 h 0 ldg BROKEN" in text
+    assert f"3 reserve 30 h 12 ldg repair 2/{repair['job_hours']} by crew 0" in text
+    assert "4 reserve 5 h 1 ldg grounded" in text
     assert "crew 0: plane 3" in text
     assert "crew 1: free" in text
     assert cells[-1] == "crew 1: free"

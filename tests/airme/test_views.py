@@ -9,10 +9,10 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from marl_sched.envs.airme.dynamics import UNDECIDED
 from marl_sched.envs.airme.graph import graph_spec
 from marl_sched.envs.airme.instance import AirmeInstance, generate
 from marl_sched.envs.airme.simulator import AirmeSimulator
+from marl_sched.envs.airme.state import UNDECIDED
 from marl_sched.envs.airme.views import FullView, LocalView
 from marl_sched.errors import InvalidOptionError
 from tests.airme.fleets import RESERVE, fleet, play

@@ -22,13 +22,8 @@ if TYPE_CHECKING:
 _RATE_STEP = 0.2  # of the exponential average of the reward rate
 
 
-class GaeConfig(
-    AlgorithmConfig, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field=NAME, tag="gae"
-):
-    """Generalised advantages along the team's turns, with a critic on the full graph.
-
-    Rows play on from update to update, `turns` turns each.
-    """
+class _CriticConfig(AlgorithmConfig, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Generalised advantages from a critic; rows play on from update to update, `turns` turns each."""
 
     instances: Count
     turns: Count
@@ -38,48 +33,36 @@ class GaeConfig(
     critic: HetGATConfig
     ppo: PpoConfig
 
+    def _build(self, setup: Setup, estimator: type[CriticEstimator], *, central: bool) -> tuple[Collector, Learner]:
+        collector = setup.segments(rows=self.instances, turns=self.turns, central=central)
+        critic = setup.critic(collector.env, self.critic)
+        credit = estimator(
+            critic,
+            discount=self.discount,
+            gae_lambda=self.gae_lambda,
+            reward_centering=self.reward_centering,
+        )
+        return collector, PolicyGradient(Ppo(setup.policy(collector.env), critic, self.ppo), credit)
+
+
+class GaeConfig(_CriticConfig, frozen=True, tag_field=NAME, tag="gae"):
+    """Generalised advantages along the team's turns, with a critic on the full graph."""
+
     def build(self, setup: Setup) -> tuple[Collector, Learner]:
         """See AlgorithmConfig."""
-        return _with_critic(setup, self, CriticEstimator, central=setup.hides)
+        return self._build(setup, CriticEstimator, central=setup.hides)
 
     def knowledge(self, config: TrainConfig) -> list[str]:
         """The critic's, where agents see less."""
         return ["a critic on the full graph"] if config.make_view().hides else []
 
 
-class IppoConfig(
-    AlgorithmConfig, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field=NAME, tag="ippo"
-):
-    """Generalised advantages along each agent's own turns, with a critic on what the agent sees.
-
-    Rows play on from update to update, `turns` turns each.
-    """
-
-    instances: Count
-    turns: Count
-    discount: Share
-    gae_lambda: Share
-    reward_centering: bool
-    critic: HetGATConfig
-    ppo: PpoConfig
+class IppoConfig(_CriticConfig, frozen=True, tag_field=NAME, tag="ippo"):
+    """Generalised advantages along each agent's own turns, with a critic on what the agent sees."""
 
     def build(self, setup: Setup) -> tuple[Collector, Learner]:
         """See AlgorithmConfig."""
-        return _with_critic(setup, self, OwnTurns, central=False)
-
-
-def _with_critic(
-    setup: Setup, config: GaeConfig | IppoConfig, estimator: type[CriticEstimator], *, central: bool
-) -> tuple[Collector, Learner]:
-    collector = setup.segments(rows=config.instances, turns=config.turns, central=central)
-    critic = setup.critic(collector.env, config.critic)
-    credit = estimator(
-        critic,
-        discount=config.discount,
-        gae_lambda=config.gae_lambda,
-        reward_centering=config.reward_centering,
-    )
-    return collector, PolicyGradient(Ppo(setup.policy(collector.env), critic, config.ppo), credit)
+        return self._build(setup, OwnTurns, central=False)
 
 
 class CriticEstimator:

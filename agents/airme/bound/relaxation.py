@@ -39,8 +39,8 @@ from marl_sched.agents.airme.bound.plane import (
     solve,
 )
 from marl_sched.envs.airme.aircraft import FailureModel
-from marl_sched.envs.airme.dynamics import OBJECTIVES
 from marl_sched.envs.airme.instance import AirmeInstance
+from marl_sched.envs.airme.state import OBJECTIVES
 from marl_sched.errors import InvalidOptionError, UnknownNameError
 
 # Prices may change at these hours from the start and from the end: crews are short while the initial backlog
