@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from marl_sched.domain import Domain
 
@@ -20,12 +20,14 @@ class Benchmark:
         play: what is timed.
         per_second: what a second that `play` takes counts in the figure: 1e6 / n gives microseconds for each of n.
         meaning: what the figure is of.
+        better: whether a higher or a lower figure is the faster one; a time is lower.
         prepare: run before every `play`, untimed.
     """
 
     play: Callable[[], Any]
     per_second: float
     meaning: str
+    better: Literal["higher", "lower"] = "lower"
     prepare: Callable[[], Any] = lambda: None
 
 

@@ -8,10 +8,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
 
+import msgspec
 import numpy as np
 import torch
+from msgspec import Struct
 
 from marl_sched.agents.benchmark import own_benchmarks
 from marl_sched.agents.networks.hetgat.network import HetGATNetwork
@@ -19,25 +22,87 @@ from marl_sched.agents.policies.network_policy import NetworkPolicy
 from marl_sched.domain import Domain
 from marl_sched.envs.api.aec import SchedulingAEC
 from marl_sched.envs.api.torchrl_env import SchedulingTorchRL
-from marl_sched.errors import InvalidOptionError
+from marl_sched.errors import InvalidFileError, InvalidOptionError
+from marl_sched.files import read_json
 from marl_sched.graph import ACTION_MASK
+from marl_sched.noise import Stream, uniforms
 from marl_sched.simulation import TurnSimulator
 
-SCHEMA = 1
+SCHEMA = 2  # 1 had no calibration, its figures stood beside its head, and those of the policy below a scale's name
 BATCH = 1024
+SLOWER = 1.10  # a ratio from which on a figure counts as slower
 _AEC_TURNS = 5_000
 _TORCHRL_STEPS = 100
 _POLICY_DECISIONS = 200
+_CALIBRATION_ROWS, _CALIBRATION_TURNS, _CALIBRATION_PRODUCTS = 2**18, 20_000, 64
 _MEANINGS = {
     "aec_turns_per_s": "AEC turns with observations, small instance, random legal choices: last() and step()",
     "torchrl_decisions_per_s": "decisions of a TorchRL batch of small instances with full observations, "
     "random legal choices: rand_action() and step_and_maybe_reset()",
-    "policy_ms": "one decision of the default HetGAT policy at batch size 1 with a full view, observing included",
+    "policy_ms": "one decision of the default HetGAT policy at batch size 1 with a full view, observing included, "
+    "milliseconds",
 }
 
 
-def bench(domain: Domain, *, repeats: int = 5, batch: int | None = None) -> dict[str, Any]:
-    """All figures of a domain, ready for JSON; `meaning` says what each of them is of. Uses one thread.
+class Figure(Struct, frozen=True, forbid_unknown_fields=True):
+    """What was measured, whether more of it is faster, and what it is of."""
+
+    value: float
+    better: Literal["higher", "lower"]
+    meaning: str
+
+
+class Bench(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The figures of a domain on one machine; as JSON what `marl-sched bench --json` writes and `--against` reads.
+
+    Attributes:
+        repeats, batch: see `bench`.
+        statistic: how a figure follows from the repeats.
+        calibration_ms: CPU milliseconds of work that never changes (`calibration`), to tell machines apart.
+        figures: by their names.
+    """
+
+    schema: Literal[2] = 2
+    env: str
+    threads: int = 1
+    repeats: int
+    batch: int
+    statistic: str = "best of repeats, CPU time"
+    calibration_ms: float
+    figures: dict[str, Figure]
+
+    def against(self, earlier: Bench) -> dict[str, float]:
+        """How much slower each figure is than an earlier one of the same name, 1 for as fast as then.
+
+        Times are in units of each machine's calibration, so that a slower machine alone changes nothing. Raises
+        InvalidOptionError for figures of another domain or batch.
+        """
+        for name in ("env", "batch"):
+            now, then = getattr(self, name), getattr(earlier, name)
+            if now != then:
+                raise InvalidOptionError(f"bench: {name}: expected {now} as now, got figures of {then}")
+        machine = self.calibration_ms / earlier.calibration_ms
+        return {
+            name: _slowdown(figure, earlier.figures[name]) / machine
+            for name, figure in self.figures.items()
+            if name in earlier.figures
+        }
+
+
+def _slowdown(now: Figure, then: Figure) -> float:
+    return then.value / now.value if now.better == "higher" else now.value / then.value
+
+
+def read_bench(path: Path) -> Bench:
+    """What `marl-sched bench --json` wrote; InvalidFileError for another file, or one of another schema."""
+    try:
+        return msgspec.convert(read_json(path), Bench)
+    except msgspec.ValidationError as error:
+        raise InvalidFileError(path, "", f"figures of `marl-sched bench`, schema {SCHEMA} ({error})") from error
+
+
+def bench(domain: Domain, *, repeats: int = 5, batch: int | None = None) -> Bench:
+    """All figures of a domain, on one thread.
 
     `batch`: envs of what is measured in batches, None: BATCH; fewer for a simulator that is not compiled.
     """
@@ -47,24 +112,37 @@ def bench(domain: Domain, *, repeats: int = 5, batch: int | None = None) -> dict
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        own = own_benchmarks(domain, batch)
+        before = calibration(repeats)
         figures = {
-            **{name: each.per_second * _best(repeats, each.prepare, each.play) for name, each in own.items()},
-            "aec_turns_per_s": aec_turns_per_second(domain, repeats),
-            "torchrl_decisions_per_s": torchrl_decisions_per_second(domain, repeats, batch),
-            "policy_ms": {scale: policy_milliseconds(domain, scale, repeats) for scale in _scales(domain)},
+            name: Figure(each.per_second * _best(repeats, each.prepare, each.play), each.better, each.meaning)
+            for name, each in own_benchmarks(domain, batch).items()
         }
+        aec, torchrl = aec_turns_per_second(domain, repeats), torchrl_decisions_per_second(domain, repeats, batch)
+        figures["aec_turns_per_s"] = Figure(aec, "higher", _MEANINGS["aec_turns_per_s"])
+        figures["torchrl_decisions_per_s"] = Figure(torchrl, "higher", _MEANINGS["torchrl_decisions_per_s"])
+        for scale in _scales(domain):
+            decision = policy_milliseconds(domain, scale, repeats)
+            figures[f"policy_ms_{scale}"] = Figure(decision, "lower", _MEANINGS["policy_ms"])
+        calibrated = min(before, calibration(repeats))
     finally:
         torch.set_num_threads(threads)
-    head = {
-        "schema": SCHEMA,
-        "env": domain.name,
-        "threads": 1,
-        "repeats": repeats,
-        "batch": batch,
-        "statistic": "best of repeats, CPU time",
-    }
-    return {**head, **figures, "meaning": {**{name: each.meaning for name, each in own.items()}, **_MEANINGS}}
+    return Bench(env=domain.name, repeats=repeats, batch=batch, calibration_ms=calibrated, figures=figures)
+
+
+def calibration(repeats: int) -> float:
+    """CPU milliseconds of a fixed mixture of what figures are made of: compiled loops, Python, and products."""
+    rows = np.arange(_CALIBRATION_ROWS)
+    keys, square = rows.astype(np.uint64), torch.ones(128, 128)
+
+    def play() -> None:
+        uniforms(keys, rows, int(Stream.POLICY), rows, 0)
+        told: dict[int, int] = {}
+        for turn in range(_CALIBRATION_TURNS):
+            told[turn % 97] = told.get(turn % 89, 0) + turn
+        for _ in range(_CALIBRATION_PRODUCTS):
+            square @ square
+
+    return 1e3 * _best(repeats, lambda: None, play)
 
 
 def _scales(domain: Domain) -> list[str]:
