@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from enum import Flag, auto
 from types import MappingProxyType
 from typing import Any, Protocol
 
@@ -17,34 +16,8 @@ import numpy as np
 
 from marl_sched.errors import InvalidOptionError
 from marl_sched.graph import ACTION_MASK
+from marl_sched.privileged import PrivilegedInfo
 from marl_sched.simulation import TurnSimulator
-
-
-class PrivilegedInfo(Flag):
-    """What a scheduler knows beyond the acting agent's observation; `str` gives it in words for results."""
-
-    NONE = 0
-    FAILURE_MODEL = auto()
-    TIME_LEFT = auto()
-    DURATIONS = auto()
-    WAITS = auto()
-    DEADLINES = auto()
-    PLACES = auto()
-
-    def __str__(self) -> str:
-        """The parts in words, such as "failure model and clock"; "" for nothing."""
-        *first, last = [_IN_WORDS[part] for part in self] or [""]
-        return f"{', '.join(first)} and {last}" if first else last
-
-
-_IN_WORDS = {
-    PrivilegedInfo.FAILURE_MODEL: "failure model",
-    PrivilegedInfo.TIME_LEFT: "clock",
-    PrivilegedInfo.DURATIONS: "all durations",
-    PrivilegedInfo.WAITS: "waits",
-    PrivilegedInfo.DEADLINES: "deadlines",
-    PrivilegedInfo.PLACES: "places",
-}
 
 
 class EpochPlayer(Protocol):
@@ -72,6 +45,11 @@ class Scheduler(ABC):
     privileged_info: PrivilegedInfo = PrivilegedInfo.NONE
     simulator_options: Mapping[str, Any] = MappingProxyType({})
     heeds_objective: bool = True
+
+    def __repr__(self) -> str:
+        """One line: the class, the name, and what it knows besides."""
+        known = f", knows {self.privileged_info}" if self.privileged_info else ""
+        return f"{type(self).__name__}({self.name}{known})"
 
     def start(self, simulator: TurnSimulator, envs: np.ndarray) -> None:
         """Called after `envs`, bool (B,), began a new episode; planners make their plans here."""

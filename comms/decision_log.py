@@ -11,7 +11,7 @@ import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any, Literal, Protocol
+from typing import IO, TYPE_CHECKING, Any, Literal, Protocol
 
 import msgspec
 
@@ -19,17 +19,40 @@ from marl_sched.comms.plant import Commit, Plant
 from marl_sched.comms.protocol.events import Choice, Outcome
 from marl_sched.errors import InvalidFileError
 
+if TYPE_CHECKING:
+    from marl_sched.comms.options import WorldOptions
+
 SCHEMA = 1
 Sync = Literal["never", "commit"]
 _FORCED = (Outcome.LATE, Outcome.ABSENT)
 
 
 class Header(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="run"):
-    """The first line: what is played. `problem` are the world's options that decide how the plant behaves."""
+    """The first line: what is played.
+
+    Attributes:
+        problem: as `Problem.as_json` gives it.
+        identity: of its instance, in hexadecimal digits: a file may change, and a generator.
+        conflict: how choices of one action are settled, see WorldOptions.
+    """
 
     schema: int
     run: str
     problem: dict[str, Any]
+    identity: str
+    conflict: str
+
+    @classmethod
+    def of(cls, options: WorldOptions) -> Header:
+        """The header of a run with these options."""
+        problem = options.problem
+        return cls(
+            schema=SCHEMA,
+            run=options.run,
+            problem=problem.as_json(),
+            identity=f"{int(problem.instances[0].identity):016x}",
+            conflict=options.conflict,
+        )
 
 
 class Resumed(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="resumed"):
@@ -146,8 +169,9 @@ def _whole_lines(path: Path) -> tuple[list[Line], int]:
 def _difference(found: Line, expected: Header) -> str:
     if not isinstance(found, Header):
         return "no header"
-    ours, theirs = msgspec.to_builtins(expected), msgspec.to_builtins(found)
-    pairs = {**{k: (theirs["problem"].get(k), v) for k, v in ours["problem"].items()}, "run": (found.run, expected.run)}
+    ours, theirs = ({**one.problem, "run": one.run, "conflict": one.conflict} for one in (expected, found))
+    pairs = {name: (theirs.get(name), value) for name, value in ours.items()}
+    pairs["identity"] = (found.identity, expected.identity)
     return ", ".join(f"{name} {was!r} instead of {now!r}" for name, (was, now) in pairs.items() if was != now)
 
 

@@ -150,7 +150,7 @@ def warm_up(world: Any, policies: list[str]) -> None:
     from marl_sched.comms.agent import load_policy
     from marl_sched.comms.plant import SimulatedPlant
 
-    plant = SimulatedPlant(world.domain(), world.telemetry(), world.simulator())
+    plant = SimulatedPlant(world.domain, world.telemetry(), world.simulator())
     state = plant.state()
     local = plant.telemetry.local_state(plant.frame, 0)
     for channel, payload in state.changed.items():

@@ -10,7 +10,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
 from fnmatch import fnmatchcase
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from marl_sched.comms.options import AgentOptions, WorldOptions
 from marl_sched.comms.protocol.events import Answered, Event, Queried, Received, TokenAppeared, TokenVanished
@@ -20,6 +20,7 @@ from marl_sched.comms.transport.inbox import Inbox
 if TYPE_CHECKING:
     from marl_sched.comms.agent import Agent
     from marl_sched.comms.decision_log import CommitLog
+    from marl_sched.comms.metrics.report import RunReport
 
 Deliver = Callable[[str, bytes], int]
 
@@ -202,7 +203,7 @@ class Threads:
         self.errors: list[BaseException] = []
         self._rules = agent_rules
 
-    def play(self) -> dict[str, Any]:
+    def play(self) -> RunReport:
         """Play the run to its end; the world's report."""
         threads = [threading.Thread(target=self.run_agent, args=(i,), daemon=True) for i in range(len(self.policies))]
         for thread in threads:
@@ -227,7 +228,7 @@ class Threads:
             self.nodes[index].close()
 
 
-def play(options: WorldOptions, policies: Sequence[str], bus: Bus | None = None) -> dict[str, Any]:
+def play(options: WorldOptions, policies: Sequence[str], bus: Bus | None = None) -> RunReport:
     """Play a run in this process, an agent with each policy; the report that `deploy` would give.
 
     Raises what an agent raised, if one did.

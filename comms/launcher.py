@@ -7,6 +7,7 @@ growing delays and a limit; a world goes on from its log. If this process ends, 
 from __future__ import annotations
 
 import json
+import logging
 import os
 import queue
 import shutil
@@ -23,8 +24,11 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from msgspec import structs
+
 from marl_sched.agents.registry import create_scheduler, scheduler_names
-from marl_sched.comms.metrics.report import SCHEMA
+from marl_sched.comms.metrics.report import SCHEMA, RunReport
+from marl_sched.comms.metrics.throttle import MAX_LINE
 from marl_sched.comms.options import AgentOptions, DeployOptions
 from marl_sched.comms.process import SIGNALS
 from marl_sched.comms.protocol.events import Ending, ExitCode
@@ -35,6 +39,7 @@ from marl_sched.domain import Domain
 from marl_sched.errors import DeploymentError
 from marl_sched.files import read_json, write_json
 
+log = logging.getLogger(__name__)
 POLL = 0.05  # seconds between two looks at the processes
 LEAVE = 10.0  # seconds that processes have to leave when the run is over or interrupted
 FIRST_DELAY, LAST_DELAY, STEADY = 0.1, 5.0, 30.0  # seconds: until a restart, at most, and alive until that is forgotten
@@ -89,13 +94,13 @@ class Deployment:
         self.policies = options.policies(self._n_agents)
         self.started_here = options.started_here(self._n_agents)
         for policy in sorted(set(self.policies)):
-            _check_policy(policy, options.world.domain())
+            _check_policy(policy, options.world.domain)
         self.endpoint = settle_port(options.world.listen)
         self.certs, self.routes = options.world.certs, dict[int, str]()
         if self.certs:
             self._check_certificates(Path(self.certs))
         self.children: dict[str, Child] = {}
-        self.phase, self.tick, self.horizon = "starting", 0, options.world.horizon
+        self.phase, self.tick, self.horizon = "starting", 0, options.world.problem.horizon
         self._said: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
         self._server: subprocess.Popen[bytes] | None = None
         self._kept, self._own_certs = bool(options.folder), ""
@@ -126,7 +131,7 @@ class Deployment:
         self.close()
 
     def _name(self, agent: int) -> str:
-        return self.options.world.domain().agent_name(agent)
+        return self.options.world.domain.agent_name(agent)
 
     def _check_certificates(self, folder: Path) -> None:
         for name in (WORLD, *(self._name(agent) for agent in self.started_here)):
@@ -135,7 +140,7 @@ class Deployment:
     def _start_server(self) -> None:
         world = replace(self.options.world, listen=self.endpoint)
         asked = json.dumps(
-            {"world": asdict(world), "policies": sorted(set(self.policies)), "remove": self._own_certs or None}
+            {"world": world.as_json(), "policies": sorted(set(self.policies)), "remove": self._own_certs or None}
         )
         with (self.folder / "fork_server.log").open("ab") as log:
             self._server = subprocess.Popen(
@@ -149,14 +154,16 @@ class Deployment:
         threading.Thread(target=self._listen, args=(self._server.stdout,), daemon=True).start()
 
     def _listen(self, lines: Any) -> None:
-        """Take in what the fork server and the world say; a line that neither of them wrote is passed over."""
+        """Take in what the fork server and the world say; a line that neither of them wrote is logged."""
         for line in lines:
             try:
                 said = json.loads(line)
             except ValueError:
-                continue
+                said = None
             if isinstance(said, dict):
                 self._said.put(said)
+            else:
+                log.warning("a process of the run wrote a line that is no report of it: %r", line[:MAX_LINE])
         self._said.put(None)
 
     def _order(self, **order: Any) -> None:
@@ -182,7 +189,7 @@ class Deployment:
         options = replace(
             self.options.world, listen=self.endpoint, report=str(self.report_path), log=log, certs=self.certs
         )
-        self._start(WORLD, "world", asdict(options))
+        self._start(WORLD, "world", options.as_json())
 
     def start_agent(self, agent: int) -> None:
         """Start an agent's process; again, if it has died."""
@@ -244,9 +251,7 @@ class Deployment:
             child.restart_at = now + min(FIRST_DELAY * 2**child.in_a_row, LAST_DELAY)
             child.in_a_row += 1
 
-    def wait(
-        self, progress: Progress | None = None, stopped: Callable[[], int | None] = lambda: None
-    ) -> dict[str, Any]:
+    def wait(self, progress: Progress | None = None, stopped: Callable[[], int | None] = lambda: None) -> RunReport:
         """Wait for the end of the run; its report, with the exit codes and restarts of all processes.
 
         `stopped` says by which signal the run is to be ended, None to go on. Raises DeploymentError if the world
@@ -272,11 +277,13 @@ class Deployment:
             self._kept = True
             raise DeploymentError(f"the world ended with {world.exit_code}: {world.complaint()}")
         self._let_leave()
-        report: dict[str, Any] = read_json(self.report_path)
-        report["exit_codes"] = {name: child.exit_code for name, child in self.children.items()}
-        report["restarts"] = {name: child.restarts for name, child in self.children.items() if child.restarts}
-        self._kept |= report["ending"]["kind"] not in (Ending.COMPLETE, Ending.INTERRUPTED)
-        return report
+        report = RunReport.from_json(read_json(self.report_path), self.report_path)
+        self._kept |= report.ending.kind not in (Ending.COMPLETE, Ending.INTERRUPTED)
+        return structs.replace(
+            report,
+            exit_codes={name: child.exit_code for name, child in self.children.items()},
+            restarts={name: child.restarts for name, child in self.children.items() if child.restarts},
+        )
 
     def _let_leave(self) -> None:
         end = time.monotonic() + LEAVE
@@ -305,7 +312,7 @@ def _world_died(code: int) -> bool:
     return code < 0 or code == ExitCode.DEFECT
 
 
-def deploy(options: DeployOptions, progress: Progress | None = None) -> dict[str, Any]:
+def deploy(options: DeployOptions, progress: Progress | None = None) -> RunReport:
     """Play one run with every agent as a process of its own; the report, with the seconds it took in all.
 
     It is also written to `options.world.report` if that is set, whatever the end, but not if the start was refused.
@@ -315,7 +322,8 @@ def deploy(options: DeployOptions, progress: Progress | None = None) -> dict[str
     """
     started = time.monotonic()
     deployment: Deployment | None = None
-    report: dict[str, Any] | None = None
+    report: RunReport | None = None
+    failed: dict[str, Any] | None = None
     try:
         with _signals() as stopped:
             import marl_sched.comms.transport.zenoh_session  # noqa: F401  (not installed: missed here, not in a child)
@@ -327,18 +335,20 @@ def deploy(options: DeployOptions, progress: Progress | None = None) -> dict[str
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else int(ExitCode.DEFECT)
         reason = f"signal {code - 128}" if code > 128 else f"the caller ended it: {end.code}"
-        report = _no_report(options, Ending.INTERRUPTED, reason, code)
+        failed = _no_report(options, Ending.INTERRUPTED, reason, code)
         raise
     except Exception as error:
         if deployment is not None:  # else it was refused, and nothing was started
-            report = _no_report(options, Ending.FAILED, str(error), int(ExitCode.USER_ERROR))
+            failed = _no_report(options, Ending.FAILED, str(error), int(ExitCode.USER_ERROR))
         raise
     finally:
+        seconds = round(time.monotonic() - started, 3)
         if report is not None:
-            report["seconds_in_all"] = round(time.monotonic() - started, 3)
-            if options.world.report:
-                write_json(options.world.report, report)
-    if report["ending"]["kind"] == Ending.INTERRUPTED and stopped.number is not None:
+            report = structs.replace(report, seconds_in_all=seconds)
+        told = failed or (None if report is None else report.as_json())
+        if told is not None and options.world.report:
+            write_json(options.world.report, {**told, "seconds_in_all": seconds})
+    if report.ending.kind == Ending.INTERRUPTED and stopped.number is not None:
         sys.exit(128 + stopped.number)
     return report
 
@@ -348,7 +358,7 @@ def _no_report(options: DeployOptions, ending: Ending, reason: str, code: int) -
     return {
         "schema": SCHEMA,
         "ending": {"kind": str(ending), "reason": reason, "exit_code": code},
-        "env": options.world.env,
+        "env": options.world.domain.name,
         "run": options.world.run,
     }
 

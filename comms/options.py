@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -12,8 +12,9 @@ from marl_sched.comms.protocol.rules import ClockKind, WorldRules
 from marl_sched.comms.security.identity import WORLD, Identity
 from marl_sched.comms.transport.endpoints import is_encrypted, is_loopback
 from marl_sched.comms.transport.faulty import Faults
-from marl_sched.domain import Domain, Telemetry, get_domain
+from marl_sched.domain import Domain, Telemetry
 from marl_sched.errors import InvalidOptionError, require
+from marl_sched.problem import Problem
 
 if TYPE_CHECKING:
     from marl_sched.comms.plant import SimulatedPlant
@@ -30,16 +31,10 @@ Conflict = Literal["turns", "priority"]
 
 @dataclass(frozen=True, kw_only=True)
 class WorldOptions:
-    """The plant: which problem, how agents see it, and how long it waits for them. Times in seconds.
+    """The plant: which problem it plays, and how long it waits for agents. Times in seconds.
 
     Attributes:
-        env: a domain's name.
-        scale: of the generated instance and of the padding.
-        instance: an instance file, of no scale; "" generates the scale's first instance of `seed`.
-        seed: of the instance's generator and of the noise.
-        horizon: simulated time of the run; 0: the domain's.
-        objective: what the run is rewarded for; "": the domain's first.
-        view, view_options: what agents see.
+        problem: of one instance, of which episode 0 is played.
         run: the run's name, part of every key.
         listen: endpoint, port 0 takes a free one.
         certs: folder of certificates, which a `tls/` endpoint needs; see `marl-sched certs`.
@@ -66,14 +61,7 @@ class WorldOptions:
         faults: what happens to messages of the world, see `Faults`; of its agents too where they are deployed.
     """
 
-    env: str
-    scale: str = "small"
-    instance: str = ""
-    seed: int = 0
-    horizon: int = 0
-    objective: str = ""
-    view: str = "full"
-    view_options: Mapping[str, int | float] = field(default_factory=dict)
+    problem: Problem
     run: str = "run"
     listen: str = DEFAULT_ENDPOINT
     certs: str = ""
@@ -113,8 +101,8 @@ class WorldOptions:
             raise InvalidOptionError(f"grace: expected a number >= 0 (seconds), got {self.grace}")
         if not 0 <= self.quorum <= 1:
             raise InvalidOptionError(f"quorum: expected a share in [0, 1], got {self.quorum}")
-        if self.horizon < 0 or self.seed < 0:
-            raise InvalidOptionError(f"horizon and seed: expected integers >= 0, got {self.horizon} and {self.seed}")
+        if self.problem.count != 1:
+            raise InvalidOptionError(f"problem: expected one instance (count=1), got {self.problem.count}")
 
     def rules(self) -> WorldRules:
         """The protocol's numbers."""
@@ -136,58 +124,38 @@ class WorldOptions:
         """The world's certificate, None without `certs`; InvalidOptionError for a folder that lacks it."""
         return Identity(Path(self.certs), WORLD) if self.certs else None
 
+    def as_json(self) -> dict[str, Any]:
+        """Plain data, from which a process of the deployment makes equal options."""
+        values = {option.name: getattr(self, option.name) for option in fields(self)}
+        return {**values, "problem": self.problem.as_json()}
+
+    @property
     def domain(self) -> Domain:
-        """The domain, or UnknownNameError."""
-        return get_domain(self.env)
+        """The problem's domain."""
+        return self.problem.domain
 
     def telemetry(self) -> Telemetry:
         """How the domain's state travels; InvalidOptionError if it cannot."""
-        telemetry = self.domain().telemetry
+        telemetry = self.domain.telemetry
         if telemetry is None:
-            raise InvalidOptionError(f"env: {self.env} has no telemetry and cannot be deployed")
+            raise InvalidOptionError(f"env: {self.domain.name} has no telemetry and cannot be deployed")
         return telemetry
 
-    def load_instance(self) -> Any:
-        """The instance; typed errors for a scale or a file that does not fit."""
-        domain = self.domain()
-        domain.require_scale(self.scale)
-        return domain.load(Path(self.instance)) if self.instance else domain.instances(self.scale, 1, self.seed)[0]
-
     def simulator(self, **extra: Any) -> TurnSimulator:
-        """The plant's simulator, one instance at the start of its episode; typed errors for options that do not fit.
+        """The plant's simulator, at the start of its episode; typed errors for options that do not fit.
 
         `extra` are further options of the domain's simulator, such as those of its pictures.
         """
-        domain = self.domain()
-        view = domain.view(self.view, **self.view_options)
-        return domain.simulator(
-            [self.load_instance()],
-            view=view,
-            objective=self.chosen_objective(),
-            horizon=self.horizon or domain.default_horizon,
-            seed=self.seed,
-            pad=None if self.instance else self.scale,
-            **extra,
-        )
+        simulator = self.problem.simulator(**extra)
+        simulator.reset(seed=self.problem.seed, episodes=self.problem.episode_numbers([0]))
+        return simulator
 
     def plant(self, **extra: Any) -> SimulatedPlant:
         """The plant at the start of its episode; `extra` as for `simulator`."""
         from marl_sched.comms.plant import SimulatedPlant, SimultaneousPlant
 
         kind = SimultaneousPlant if self.conflict == "priority" else SimulatedPlant
-        return kind(self.domain(), self.telemetry(), self.simulator(**extra))
-
-    def chosen_objective(self) -> str:
-        """The objective, or UnknownNameError."""
-        domain = self.domain()
-        return domain.require_objective(self.objective or domain.objectives[0])
-
-    def problem(self) -> dict[str, Any]:
-        """The options that decide how the plant behaves, and which instance it is, as a run's log has them."""
-        names = ("env", "scale", "instance", "seed", "horizon", "objective", "view", "conflict")
-        given: dict[str, Any] = {name: getattr(self, name) for name in names}
-        identity = int(self.load_instance().identity)
-        return {**given, "view_options": dict(self.view_options), "identity": f"{identity:016x}"}
+        return kind(self.domain, self.telemetry(), self.simulator(**extra))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -268,18 +236,18 @@ class DeployOptions:
         """One policy per agent; UnknownNameError for an agent that does not exist."""
         names = self._names(n_agents)
         for name in self.agent_policies:
-            require(f"agent of this {self.world.env} problem", name, names)
+            require(f"agent of this {self.world.domain.name} problem", name, names)
         return [self.agent_policies.get(name, self.policy) for name in names]
 
     def started_here(self, n_agents: int) -> list[int]:
         """Indices of the agents that are started here; UnknownNameError for one that does not exist."""
         names = self._names(n_agents)
         for name in self.agents:
-            require(f"agent of this {self.world.env} problem", name, names)
+            require(f"agent of this {self.world.domain.name} problem", name, names)
         return [i for i, name in enumerate(names) if not self.agents or name in self.agents]
 
     def _names(self, n_agents: int) -> list[str]:
-        return [self.world.domain().agent_name(i) for i in range(n_agents)]
+        return [self.world.domain.agent_name(i) for i in range(n_agents)]
 
 
 def _require_positive(options: Any, *names: str) -> None:

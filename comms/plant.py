@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Protocol
 
 import msgspec
 import numpy as np
@@ -35,6 +35,26 @@ class Commit(msgspec.Struct, frozen=True, kw_only=True):
     share: float
 
 
+class PlantSummary(msgspec.Struct, frozen=True, kw_only=True):
+    """The plant's part of a report.
+
+    Attributes:
+        time: simulated time.
+        objectives: means over the run so far, by name.
+        series: objectives of every unit of time so far.
+        agent_figures: what every agent did so far, one value for each (`TurnSimulator.agent_figures`).
+    """
+
+    time: int
+    objectives: dict[str, float]
+    series: dict[str, list[float]]
+    agent_figures: dict[str, list[float]]
+
+    def of_agent(self, agent: int) -> dict[str, float]:
+        """The figures of one agent, by name."""
+        return {name: values[agent] for name, values in self.agent_figures.items()}
+
+
 class Plant(Protocol):
     """What is scheduled. Its methods are called one at a time, by one thread.
 
@@ -57,7 +77,7 @@ class Plant(Protocol):
     def objectives(self) -> dict[str, float]:
         """The objectives so far, by name."""
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> PlantSummary:
         """The plant's part of the report."""
 
 
@@ -114,12 +134,14 @@ class SimulatedPlant:
         """See Plant.objectives."""
         return {name: float(values[0]) for name, values in self.simulator.objectives().items()}
 
-    def summary(self) -> dict[str, Any]:
-        """See Plant.summary: simulated time, objectives, and their series."""
+    def summary(self) -> PlantSummary:
+        """See Plant.summary."""
         objectives = self.objectives()
         series = self.telemetry.series(self.simulator)
         figures = {name: values[0].tolist() for name, values in self.simulator.agent_figures().items()}
-        return {"time": int(self.simulator.time[0]), "objectives": objectives, "agent_figures": figures, **series}
+        return PlantSummary(
+            time=int(self.simulator.time[0]), objectives=objectives, series=series, agent_figures=figures
+        )
 
 
 class SimultaneousPlant(SimulatedPlant):

@@ -21,6 +21,7 @@ import msgspec
 from marl_sched.comms.protocol.events import ExitCode, Interrupted
 from marl_sched.comms.transport.base import Transport
 from marl_sched.errors import InvalidOptionError, MarlSchedError
+from marl_sched.problem import Problem
 
 T = TypeVar("T")
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -35,9 +36,16 @@ def parse_options(text: str, kind: type[T]) -> T:
         unknown = sorted(set(values) - {field.name for field in fields(kind)})  # type: ignore[arg-type]  # a dataclass
         if unknown:
             raise InvalidOptionError(f"options: unknown {', '.join(unknown)}")
-        return msgspec.convert(values, kind)
+        return msgspec.convert(values, kind, dec_hook=_decode)
     except msgspec.DecodeError as error:
         raise InvalidOptionError(f"options: {error}") from error
+
+
+def _decode(kind: type, content: Any) -> Any:
+    """Msgspec's hook for what is no plain value."""
+    if kind is Problem:
+        return Problem.from_json(content)
+    raise NotImplementedError(kind)
 
 
 @contextmanager

@@ -3,7 +3,7 @@
 The protocol (`marl_sched.comms.protocol.world_protocol`) decides what happens; this file carries it out. It imports
 no policy and no torch.
 
-By hand: `python -m marl_sched.comms.world '{"env": "...", "seed": 1, "horizon": 48}'`, or `marl-sched world`.
+By hand: `marl-sched world`, or `python -m marl_sched.comms.world OPTIONS`, which are `WorldOptions.as_json` as JSON.
 """
 
 from __future__ import annotations
@@ -14,10 +14,9 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-from marl_sched.comms.decision_log import SCHEMA, CommitLog, FileLog, Header, MemoryLog, Resumed, Step, play_again
-from marl_sched.comms.metrics.report import build_report
+from marl_sched.comms.decision_log import CommitLog, FileLog, Header, MemoryLog, Resumed, Step, play_again
+from marl_sched.comms.metrics.report import RunReport, build_report
 from marl_sched.comms.metrics.run_metrics import RunMetrics
 from marl_sched.comms.metrics.throttle import ThrottledLog
 from marl_sched.comms.observation import Observation
@@ -75,7 +74,7 @@ class World:
     ) -> None:
         """`plant`: the domain's simulator unless given, at its start or, with a log, where that ends."""
         self.options, self.transport, self.metrics, self._clock = options, transport, RunMetrics(), clock
-        self.domain, self.telemetry = options.domain(), options.telemetry()
+        self.domain, self.telemetry = options.domain, options.telemetry()
         self.plant: Plant = plant or options.plant()
         self.epoch = f"{time.time_ns():x}-{os.getpid():x}"
         self.commits = commits if commits is not None else MemoryLog()
@@ -100,10 +99,9 @@ class World:
         self._told: tuple[str, int] = ("", -1)
         self._tick = 0
         self._refused = refused or Refusals()
-        horizon = options.horizon or self.domain.default_horizon
-        self._observation = Observation(self.domain.agent_prefix, self.telemetry.time_unit, horizon)
+        self._observation = Observation(self.domain.agent_prefix, self.telemetry.time_unit, options.problem.horizon)
 
-    def run(self) -> dict[str, Any]:
+    def run(self) -> RunReport:
         """Gather the agents, play the episode, say goodbye; the report, whatever the end.
 
         DeploymentError, with the report as its `report`, if not all agents came in time. An error of the plant is
@@ -211,7 +209,7 @@ class World:
         elif note.event == "slept":
             self.metrics.slept_s += note.waited
         name = "world" if note.agent < 0 else self.domain.agent_name(note.agent)
-        self.metrics.note_event(self.telemetry.time_unit, self._tick, name, note.event, note.waited)
+        self.metrics.note_event(self._tick, name, note.event, note.waited)
         if note.agent >= 0 and self.protocol.phase != "gathering":
             self._tell_observers()
         log.info("%s %d: %s %s", self.telemetry.time_unit, self._tick, name, note.event)
@@ -220,9 +218,9 @@ class World:
         now = (self.protocol.phase, self._tick)
         if now != self._told:
             self._told = now
-            self._progress(*now, self.options.horizon or self.domain.default_horizon)
+            self._progress(*now, self.options.problem.horizon)
 
-    def _report(self, ending: ev.End, seconds: float) -> dict[str, Any]:
+    def _report(self, ending: ev.End, seconds: float) -> RunReport:
         self.metrics.counts.update(self.transport.dropped)
         self.metrics.counts.update(self._refused.counts)
         if isinstance(self.transport, FaultyTransport):
@@ -237,11 +235,11 @@ class World:
             seconds=seconds,
         )
         if self.options.report:
-            write_json(self.options.report, report)
+            write_json(self.options.report, report.as_json())
         return report
 
 
-def serve(options: WorldOptions, progress: Progress | None = None) -> dict[str, Any]:
+def serve(options: WorldOptions, progress: Progress | None = None) -> RunReport:
     """Be the world of one run; the report, which is also written to `options.report` if that is set.
 
     It goes on from `options.log` if that holds commits. SIGINT, SIGTERM and SIGHUP end the run with a report. Raises
@@ -254,14 +252,13 @@ def serve(options: WorldOptions, progress: Progress | None = None) -> dict[str, 
 
     commits: CommitLog = MemoryLog()
     if options.log:
-        header = Header(schema=SCHEMA, run=options.run, problem=options.problem())
-        commits = FileLog(Path(options.log), header, options.sync)
+        commits = FileLog(Path(options.log), Header.of(options), options.sync)
     identity, plant, refused = options.identity(), options.plant(), Refusals()
     with counted_refusals(refused.count, refused.tell):
         transport: Transport = hub(
             options.run,
             settle_port(options.listen),
-            options.domain().agent_prefix,
+            options.domain.agent_prefix,
             options.lease,
             identity=identity,
             channels=plant.channels,
@@ -276,9 +273,9 @@ def serve(options: WorldOptions, progress: Progress | None = None) -> dict[str, 
             transport.close()
 
 
-def exit_code_of(report: dict[str, Any]) -> int:
+def exit_code_of(report: RunReport) -> int:
     """What a process ends with after a run."""
-    return int(report["ending"]["exit_code"])
+    return report.ending.exit_code
 
 
 if __name__ == "__main__":

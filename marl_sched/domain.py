@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from numbers import Real
 from pathlib import Path
@@ -20,6 +20,7 @@ import numpy as np
 from marl_sched.errors import InvalidOptionError, MarlSchedError, require
 from marl_sched.noise import Split, instance_generator
 from marl_sched.plugins import DOMAINS, import_object, load_offered, offered
+from marl_sched.privileged import PrivilegedInfo
 
 if TYPE_CHECKING:
     from gymnasium.spaces import Space
@@ -177,9 +178,12 @@ class Domain:
         reference: name of the scheduler over which M2 is the gain; None: results have no M2.
         schedulers: scheduler's name -> factory, or `package.module:attribute` of such a table; more may be added by
             entry points of the group `marl_sched.schedulers`.
+        hidden_info: what nobody can know in the field, such as by which chances things fail. Tables hold no rule that
+            knows it against the others.
         feasible: instance -> whether a schedule of it can be feasible, found by search; None: nothing tells.
         benchmarks: (domain, batch) -> what `marl-sched bench` measures of this domain alone; None: nothing.
         bound: the module, by its name, that proves upper bounds (`Relaxation` and `upper_bounds`); None: none is known.
+        bound_info: what the bound knows, and so holds for every scheduler that knows no more.
         generate_accepted: (scale, rng, accept) -> an instance that `accept` takes, redrawn until it does; None:
             every generated instance can be solved.
         instance_files: folder -> the files in it that should hold an instance each, sorted.
@@ -219,9 +223,11 @@ class Domain:
     better: Literal["higher", "lower"] = "higher"
     reference: str | None = None
     schedulers: Mapping[str, Callable[..., Any]] | str = field(default_factory=dict)
+    hidden_info: PrivilegedInfo = PrivilegedInfo.NONE
     feasible: Callable[[Any], bool] | None = None
     benchmarks: Callable[[Any, int], Mapping[str, Any]] | None = None
     bound: str | None = None
+    bound_info: PrivilegedInfo = PrivilegedInfo.NONE
     best_of: Callable[[Any, int], Any] | None = None
     generate_accepted: Callable[[str, np.random.Generator, Callable[[Any], bool]], Any] | None = None
     impossibilities: Callable[[Any], list[str]] = _none_known
@@ -249,6 +255,15 @@ class Domain:
     def agent_names(self, instance: Any, count: int) -> list[str]:
         """What an instance's agents are called: by its own `agent_names` where it has them, else `agent_name`."""
         return list(getattr(instance, "agent_names", ())) or [self.agent_name(i) for i in range(count)]
+
+    @property
+    def default_scale(self) -> str:
+        """The scale where none is named: the smallest."""
+        return next(iter(self.scales))
+
+    def largest_scale(self, scales: Iterable[str]) -> str:
+        """The largest of these scales, whose padding fits the instances of all; UnknownNameError for another name."""
+        return max(map(self.require_scale, scales), key=list(self.scales).index)
 
     def instances(self, scale: str, count: int, seed: int, split: Split = "test") -> list[Any]:
         """`count` instances of a scale; instance i depends on (seed, split, i) alone (marl_sched.noise).

@@ -23,7 +23,7 @@ from marl_sched.plugins import OBJECTIVES, import_object, is_object_name, load_o
 from marl_sched.simulation import Observation, TurnSimulator
 
 if TYPE_CHECKING:
-    from marl_sched.domain import Domain
+    from marl_sched.domain import CentralInterface, Domain
 
 
 class Objective(Protocol):
@@ -81,7 +81,7 @@ class ScoredSimulator(TurnSimulator):
     def __getattr__(self, name: str) -> Any:
         """Attributes of the domain's simulator; a joint step of its own would leave the reward behind."""
         if name.startswith(("__", "play_")) or name == "inner":
-            raise AttributeError(f"{name}: an objective from outside is paid turn by turn, expected step()")
+            raise AttributeError(f"{name}: expected step() or play_jointly(), which pay an objective from outside")
         return getattr(self.inner, name)
 
     def _begin(self, envs: np.ndarray) -> None:
@@ -104,6 +104,15 @@ class ScoredSimulator(TurnSimulator):
     def step(self, actions: np.ndarray) -> None:
         """Take one turn in every env, and pay what the objective grew by."""
         self.inner.step(actions)
+        self._pay()
+
+    def play_jointly(self, central: CentralInterface, action: Any) -> tuple[float, dict[str, Any]]:
+        """Play a joint action of env 0 on the domain's simulator, and pay what the objective grew by."""
+        _, infos = central.play(self.inner, action)
+        self._pay()
+        return float(self.reward[0]), infos
+
+    def _pay(self) -> None:
         total = self._objective.total(self.inner)
         self.rewards[:] = total - self._paid
         self.reward[:] = self.rewards.sum(axis=1)

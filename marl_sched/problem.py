@@ -9,15 +9,15 @@ Defaults are filled in here and nowhere else: what holds a problem needs no defa
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from marl_sched.domain import Domain, get_domain
-from marl_sched.errors import InvalidFileError, InvalidOptionError, require_integer
-from marl_sched.noise import as_seed, instance_generator
+from marl_sched.errors import InvalidFileError, InvalidOptionError, require, require_integer
+from marl_sched.noise import SPLITS, Split, as_seed, episode_number, instance_generator
 
 if TYPE_CHECKING:
     from marl_sched.simulation import TurnSimulator
@@ -28,7 +28,6 @@ MOST = 2**31 - 1
 MOST_INSTANCES = 100_000  # drawn at once: seconds and some hundred MB of small fleets
 
 
-@dataclass(frozen=True, init=False)
 class Problem:
     """What is to be scheduled and under which conditions; immutable.
 
@@ -37,6 +36,7 @@ class Problem:
         scale: of the generated instances; None where `instances` are given.
         count: number of instances.
         seed: of the generated instances and of the noise.
+        split: "train", "validation" or "test": instances and noise of different splits never meet (marl_sched.noise).
         given: the instances, where they are not generated.
         files: the file of each given instance, None for one that was given as an object.
         pad: the scale whose largest instance sets the padded sizes; None: the largest of the instances does.
@@ -51,6 +51,7 @@ class Problem:
     scale: str | None
     count: int
     seed: int
+    split: Split
     given: tuple[Any, ...] | None
     files: tuple[Path | None, ...] | None
     pad: str | None
@@ -68,6 +69,7 @@ class Problem:
         scale: str | None = None,
         count: int | None = None,
         seed: int = 0,
+        split: Split = "test",
         pad: str | None = None,
         episodes: int = EPISODES,
         horizon: int | None = None,
@@ -79,14 +81,15 @@ class Problem:
 
         `instances` are objects or paths of files; without them `count` instances of `scale` (default: the domain's
         smallest) are drawn from `seed`, padded to `pad` (default: `scale`). Horizon, objective and view default to
-        the domain's, the full view. Raises InvalidOptionError, UnknownNameError, or InvalidFileError for a file.
+        the domain's, the full view, the split to what `marl-sched evaluate` plays. Raises InvalidOptionError,
+        UnknownNameError, or InvalidFileError for a file.
         """
         domain = domain if isinstance(domain, Domain) else get_domain(domain)
         given, files = _given(domain, instances)
         if given is not None and (scale is not None or count not in (None, len(given))):
             raise InvalidOptionError("scale, count: expected neither where instances are given; `pad` sets the padding")
         if given is None:
-            scale = domain.require_scale(next(iter(domain.scales)) if scale is None else scale)
+            scale = domain.require_scale(domain.default_scale if scale is None else scale)
             pad = scale if pad is None else pad
             count = require_integer("count", COUNT if count is None else count, 1, MOST_INSTANCES)
         values = {
@@ -94,6 +97,7 @@ class Problem:
             "scale": scale,
             "count": len(given) if given is not None else count,
             "seed": as_seed(seed),
+            "split": require("split", split, SPLITS),
             "given": given,
             "files": files,
             "pad": None if pad is None else domain.require_scale(pad),
@@ -106,17 +110,24 @@ class Problem:
             "options": dict(options or {}),
         }
         domain.require_options(values["options"])
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+        vars(self).update(values)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """A problem never changes: AttributeError."""
+        raise AttributeError(f"{name}: a Problem never changes; but() makes another one")
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Problem:
+        """Itself: a problem never changes."""
+        return self
 
     def but(self, **changes: Any) -> Problem:
         """The same problem with other arguments of the constructor; giving `instances` drops scale and count."""
         arguments: dict[str, Any] = {
             name: getattr(self, name)
-            for name in ("domain", "seed", "pad", "episodes", "horizon", "objective", "view", "options")
+            for name in ("domain", "seed", "split", "pad", "episodes", "horizon", "objective", "view", "options")
         }
         if self.given is not None:
-            arguments["instances"] = [file or one for one, file in zip(self.given, self.files or (), strict=True)]
+            arguments["instances"] = self.given
         else:
             arguments |= {"scale": self.scale, "count": self.count}
             if self.pad == self.scale and "scale" in changes:
@@ -124,14 +135,17 @@ class Problem:
         if "instances" in changes or ("scale" in changes and self.given is not None):
             for name in ("instances", "scale", "count"):
                 arguments.pop(name, None)
-        return Problem(**{**arguments, **changes})
+        problem = Problem(**{**arguments, **changes})
+        if problem.given is not None and "instances" not in changes:
+            vars(problem)["files"] = self.files  # which are not read again
+        return problem
 
     @cached_property
     def instances(self) -> tuple[Any, ...]:
         """The instances, given or drawn; drawn once."""
         if self.given is not None:
             return self.given
-        return tuple(self.domain.instances(str(self.scale), self.count, self.seed))
+        return tuple(self.domain.instances(str(self.scale), self.count, self.seed, self.split))
 
     @property
     def unit(self) -> str:
@@ -149,7 +163,10 @@ class Problem:
         `indices` chooses instances, any of them repeatedly; `changes` are options of the simulator that go before
         the problem's. A simulator's own errors are passed on.
         """
-        instances = self.instances if indices is None else [self.instances[i] for i in indices]
+        return self.simulator_of(self.instances if indices is None else [self.instances[i] for i in indices], **changes)
+
+    def simulator_of(self, instances: Sequence[Any], **changes: Any) -> TurnSimulator:
+        """The simulator of other instances under the same conditions; `changes` as for `simulator`."""
         arguments = {
             "view": self.view,
             "objective": self.objective,
@@ -160,11 +177,19 @@ class Problem:
         }
         return self.domain.make_simulator(instances, **{**arguments, **changes})
 
-    def episode(self, index: int) -> Any:
-        """The instance of episode `index` of an environment that draws a new one for each; a given one is fixed."""
+    def instance(self, index: int, seed: int | None = None) -> Any:
+        """Instance `index`, drawn anew, of any number beyond `count` too; given ones are met in turn.
+
+        `seed` draws that of another seed in the same split.
+        """
         if self.given is not None:
             return self.given[index % len(self.given)]
-        return self.domain.generate(str(self.scale), instance_generator(self.seed, index))
+        generator = instance_generator(self.seed if seed is None else seed, index, self.split)
+        return self.domain.generate(str(self.scale), generator)
+
+    def episode_numbers(self, episodes: Iterable[int]) -> list[int]:
+        """The numbers by which the noise knows episodes 0, 1, ... of an instance in this split."""
+        return [episode_number(int(episode), self.split) for episode in episodes]
 
     def as_json(self) -> dict[str, Any]:
         """Plain data, schema 1, from which `from_json` makes an equal problem.
@@ -180,6 +205,7 @@ class Problem:
         return data | {
             "pad": self.pad,
             "seed": self.seed,
+            "split": self.split,
             "episodes": self.episodes,
             "horizon": self.horizon,
             "unit": self.unit,
@@ -225,7 +251,7 @@ class Problem:
         return hash((self.domain.name, self.scale, self.count, self.seed, self.horizon, self.objective))
 
     def _key(self) -> tuple[Any, ...]:
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        values = {name: getattr(self, name) for name in Problem.__annotations__}
         values["domain"] = self.domain.name
         values["given"] = None if self.given is None else [one.identity for one in self.given]
         del values["files"]
@@ -235,13 +261,14 @@ class Problem:
         """One line: `Problem(airme, 20 x small, seed 1, 10 episodes of 720 hours, profit, view local reach 1 ...)`."""
         source = f"{self.count} given" if self.given is not None else f"{self.count} x {self.scale}"
         options = "".join(f", {name} {value}" for name, value in self.options.items())
+        split = "" if self.split == "test" else f" of {self.split}"
         return (
-            f"Problem({self.domain.name}, {source}, seed {self.seed}, {self.episodes} episodes of {self.length}, "
-            f"{self.objective}, view {view_in_words(self.view)}{options})"
+            f"Problem({self.domain.name}, {source}, seed {self.seed}{split}, {self.episodes} episodes of "
+            f"{self.length}, {self.objective}, view {view_in_words(self.view)}{options})"
         )
 
 
-_ARGUMENTS = ("pad", "seed", "episodes", "horizon", "objective", "view", "options")
+_ARGUMENTS = ("pad", "seed", "split", "episodes", "horizon", "objective", "view", "options")
 
 
 def _given(

@@ -11,13 +11,16 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from marl_sched.errors import IllegalActionError, InvalidOptionError
 from marl_sched.graph import ACTION_MASK, ArraySpec, GraphSpec
 from marl_sched.noise import Stream, uniforms
+
+if TYPE_CHECKING:
+    from marl_sched.domain import CentralInterface
 
 Observation = dict[str, np.ndarray]
 _POLICY = int(Stream.POLICY)  # a compiled function takes fifteen times as long to recognise an IntEnum
@@ -149,6 +152,10 @@ class TurnSimulator(ABC):
             raise IllegalActionError(f"row {env_index}: agent {agent} has no turn at time {self.time[env_index]}")
         self.acting[env_index] = agent
 
+    def play_jointly(self, central: CentralInterface, action: Any) -> tuple[float, dict[str, Any]]:
+        """Take all turns that a joint action covers in env 0; the reward it brought and the step's infos."""
+        return central.play(self, action)
+
     @abstractmethod
     def objectives(self) -> dict[str, np.ndarray]:
         """The domain's measures of the running or finished episodes, name -> float64 (B,)."""
@@ -259,6 +266,14 @@ class TurnSimulator(ABC):
         Called after the simulator was copied, unpickled or brought to a saved state. A domain whose attributes are
         views overrides it: copying an array severs its views.
         """
+
+    def __repr__(self) -> str:
+        """One line: `AirmeSimulator(2 envs of 720 hours, view local (reach 1, comm 1, staleness 0), at 24, 31)`."""
+        from marl_sched.problem import view_in_words
+
+        times = ", ".join(map(str, self.time[:3].tolist())) + (", ..." if self.batch > 3 else "")
+        envs = f"{self.batch} env{'' if self.batch == 1 else 's'} of {self.horizon} {self.unit}"
+        return f"{type(self).__name__}({envs}, view {view_in_words(self.view)}, at {times})"
 
     def new_observation(self) -> Observation:
         """Zeroed arrays of an observation for this batch, to pass as `out`."""

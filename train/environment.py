@@ -15,7 +15,7 @@ on nothing but its number among all rows of the run, whichever process holds it.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -25,11 +25,11 @@ from torchrl.data import Composite, Unbounded
 
 from marl_sched.agents.base import CostScheduler
 from marl_sched.agents.registry import create_scheduler
-from marl_sched.domain import Domain, get_domain
+from marl_sched.domain import Domain
 from marl_sched.envs.api.torchrl_env import SchedulingTorchRL
 from marl_sched.errors import InvalidOptionError
 from marl_sched.graph import ACTION_MASK
-from marl_sched.noise import instance_generator
+from marl_sched.problem import Problem
 from marl_sched.simulation import SavedState
 from marl_sched.train.curriculum import EpisodeLength
 
@@ -39,28 +39,27 @@ CENTRAL, COSTS, MEMORY = "central", "costs", "memory"
 class InstanceSource:
     """The instances of a run: of `rows` rows, row b's episode n plays instance (n rows + b) // episodes.
 
-    An instance depends on (seed, its number) and on its scale, and scales take turns. All are of the split "train",
-    which neither validation nor evaluation meets.
+    An instance depends on the problem's seed and split, on its number and on its scale, and scales take turns.
     """
 
-    def __init__(self, domain: Domain, scales: Sequence[str], *, seed: int, rows: int, episodes: int = 1) -> None:
-        self._domain, self._scales, self._seed = domain, tuple(scales), seed
+    def __init__(self, problem: Problem, scales: Sequence[str], *, rows: int, episodes: int = 1) -> None:
+        self._of_scale = [problem.but(scale=scale) for scale in scales]
         self._rows, self._episodes = rows, episodes
 
     def __call__(self, row: int, count: int) -> Any:
         """The instance that a row plays in its episode `count`."""
         number = (count * self._rows + row) // self._episodes
-        rng = instance_generator(self._seed, number, "train")
-        return self._domain.generate(self._scales[number % len(self._scales)], rng)
+        return self._of_scale[number % len(self._of_scale)].instance(number)
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingTask:
-    """What a run plays: plain values, which can be sent to a worker.
+    """What a run plays; it can be sent to a worker.
 
     Attributes:
-        domain, scales, objective, view, options: as marl_sched.train.config.TrainConfig has them.
-        seed: of instances and noise.
+        problem: the conditions, in the split "train", which neither validation nor evaluation meets. Its scale is the
+            largest of `scales`, and its horizon is longer than any episode, so that a state at a cut has a value.
+        scales: of the instances, in turn.
         rows: episodes at once, over all workers.
         episodes: rows that play the same instance.
         length: of episodes.
@@ -73,12 +72,8 @@ class TrainingTask:
         skip: episodes of each row that are left out, as those that a run had begun before it was stopped.
     """
 
-    domain: str
+    problem: Problem
     scales: Sequence[str]
-    objective: str
-    view: Mapping[str, Any]
-    options: Mapping[str, Any] = field(default_factory=dict)
-    seed: int
     rows: int
     episodes: int = 1
     length: EpisodeLength
@@ -104,24 +99,24 @@ class TrainingEnv(SchedulingTorchRL):
     changing: ClassVar[tuple[str, ...]] = (*SchedulingTorchRL.changing, "_cut", "_steps", "_memory")
 
     def __init__(self, task: TrainingTask, first: int, rows: int) -> None:
-        domain = get_domain(task.domain)
-        self.task, self._first_row = task, first
+        self.task, self._first_row, problem = task, first, task.problem
         self.episode_length = task.length(0)
         self._steps, self._resumes = 0, False  # steps of every row; whether the next reset begins nothing
         self._cut = np.zeros(rows, np.int64)  # where each row's episode is cut, in the domain's unit
         self._memory = torch.zeros(rows, *task.memory)
-        self._teacher = cost_teacher(task.teacher, domain) if task.teacher else None
-        source = InstanceSource(domain, task.scales, seed=task.seed, rows=task.rows, episodes=task.episodes)
+        self._teacher = cost_teacher(task.teacher, problem.domain) if task.teacher else None
+        source = InstanceSource(problem, task.scales, rows=task.rows, episodes=task.episodes)
         super().__init__(
-            domain,
+            problem.domain,
             batch_size=rows,
-            scale=max(task.scales, key=list(domain.scales).index),
+            scale=problem.scale,
             source=lambda row, count: source(first + row, count),
-            view=domain.make_view(task.view),
-            objective=task.objective,
-            horizon=2 * task.length.longest,  # cuts come before the end, so that a state at a cut still has a value
-            seed=task.seed,
-            **task.options,
+            view=problem.view,
+            objective=problem.objective,
+            horizon=problem.horizon,
+            seed=problem.seed,
+            split=problem.split,
+            **problem.options,
         )
 
     def _make_specs(self) -> None:

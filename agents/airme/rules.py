@@ -18,11 +18,12 @@ from marl_sched.agents.airme import ranking
 from marl_sched.agents.airme.bound.index import require_types
 from marl_sched.agents.airme.epochs import EpochPlayer
 from marl_sched.agents.airme.ranking import N_FEATURES, Ranking
-from marl_sched.agents.base import ObservationScheduler, PrivilegedInfo, best_action
+from marl_sched.agents.base import ObservationScheduler, best_action
 from marl_sched.envs.airme.aircraft import PUBLISHED_TYPES, AircraftType, FailureModel, failure_table
 from marl_sched.envs.airme.graph import PLANE
 from marl_sched.envs.airme.simulator import AirmeSimulator
 from marl_sched.errors import InvalidOptionError
+from marl_sched.privileged import PrivilegedInfo
 from marl_sched.simulation import TurnSimulator
 
 Observation = Mapping[str, np.ndarray]

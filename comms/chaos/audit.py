@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path
-from typing import Any
 
 from marl_sched.agents.registry import create_scheduler
 from marl_sched.comms.decision_log import Step, read_log
+from marl_sched.comms.metrics.report import RunReport
 from marl_sched.comms.options import WorldOptions
 from marl_sched.comms.plant import IDLE
 from marl_sched.comms.protocol.events import Choice, Outcome
@@ -15,7 +15,7 @@ from marl_sched.comms.protocol.events import Choice, Outcome
 FORCED = (Outcome.LATE, Outcome.ABSENT)
 
 
-def violations(world: WorldOptions, log: Path, before: bytes, report: dict[str, Any]) -> list[str]:
+def violations(world: WorldOptions, log: Path, before: bytes, report: RunReport) -> list[str]:
     """What in a run's log breaks an invariant, a sentence each; `before` is what the log held at an earlier moment.
 
     Every request of the plant has exactly one commit, no decision is applied twice, no target has two owners, no commit
@@ -28,9 +28,9 @@ def violations(world: WorldOptions, log: Path, before: bytes, report: dict[str, 
     found += [f"decision {source} was applied {n} times" for source, n in sources.items() if n > 1]
     if not log.read_bytes().startswith(before):
         found.append("a committed decision was lost: the log no longer begins with what it held")
-    unit, name = world.telemetry().time_unit, world.domain().agent_name
+    name = world.domain.agent_name
     logged = [(c.tick, name(c.agent), c.action, str(c.outcome)) for step in steps for c in step.commits]
-    reported = [(d[unit], d["agent"], d["action"], d["outcome"]) for d in report["decisions"]]
+    reported = [(d.time, d.agent, d.action, d.outcome) for d in report.decisions]
     if logged != reported:
         found.append(f"the report has {len(reported)} decisions that are not the log's {len(logged)}")
     return found
@@ -65,7 +65,7 @@ def _owners(steps: list[Step]) -> list[str]:
 
 def reference(world: WorldOptions, policy: str, until: int) -> tuple[list[tuple[str, int]], float]:
     """The (agent, action) pairs and the objective of the same run without messages, as far as time `until`."""
-    simulator, domain = world.simulator(), world.domain()
+    simulator, domain = world.simulator(), world.domain
     schedulers = [create_scheduler(policy, domain) for _ in range(int(simulator.n_agents[0]))]
     decided = []
     while not simulator.over[0] and simulator.time[0] < until:
@@ -73,4 +73,4 @@ def reference(world: WorldOptions, policy: str, until: int) -> tuple[list[tuple[
         action = schedulers[agent].decide(simulator)
         decided.append((domain.agent_name(agent), int(action[0])))
         simulator.step(action)
-    return decided, float(simulator.objectives()[world.chosen_objective()][0])
+    return decided, float(simulator.objectives()[world.problem.objective][0])

@@ -16,6 +16,7 @@ from marl_sched.comms.chaos.cases import CASES, Case
 from marl_sched.comms.chaos.fuzz import fuzz
 from marl_sched.comms.chaos.scene import Scene
 from marl_sched.comms.chaos.stops import end_many, plan, processes_of
+from marl_sched.comms.metrics.report import RunReport
 from marl_sched.comms.options import DeployOptions, WorldOptions
 from marl_sched.comms.protocol.events import ExitCode
 from marl_sched.comms.transport.endpoints import settle_port
@@ -58,7 +59,7 @@ class Row:
 def run_case(case: Case, world: WorldOptions, policy: str, folder: Path) -> Row:
     """Play one case in a new folder; a run that cannot be brought to its end is a problem of the row."""
     started = time.monotonic()
-    world = replace(world, **{**case.world, "horizon": ENDLESS})
+    world = replace(world, **case.world, problem=world.problem.but(horizon=ENDLESS))
     options = DeployOptions(world=world, policy=policy, folder=str(folder))
     problems: list[str] = []
     row = Row(case=case.name, secure=not world.insecure)
@@ -68,21 +69,21 @@ def run_case(case: Case, world: WorldOptions, policy: str, folder: Path) -> Row:
             scene.start()
             case.fault(scene)
             report = scene.end()
-        late = report["missed_deadlines"] + report["tick_overruns"]
+        late = report.counts["missed_deadlines"] + report.counts["tick_overruns"]
         scene.faults.update({"late": late} if late else {})
         row = replace(
             row,
-            time=report["time"],
-            decisions=len(report["decisions"]),
-            pause_s=report["longest_pause_s"],
+            time=report.time,
+            decisions=len(report.decisions),
+            pause_s=report.longest_pause_s,
             heard_s=None if scene.heard_s is None else round(scene.heard_s, 2),
-            denied=report["denied"],
-            refused=report["refused"],
+            denied=report.counts["denied"],
+            refused=report.counts["refused"],
         )
         calm = replace(world, faults={})
         problems += violations(calm, folder / "run.jsonl", scene.before, report)
-        decided, objective = reference(calm, policy, report["time"])
-        row = replace(row, cost=_cost(calm, objective, report["M1"]))
+        decided, objective = reference(calm, policy, report.time)
+        row = replace(row, cost=_cost(calm, objective, report.M1))
         problems += _judged(case, row, report, scene, decided)
     except MarlSchedError as error:
         problems.append(f"{type(error).__name__}: {error}")
@@ -92,19 +93,17 @@ def run_case(case: Case, world: WorldOptions, policy: str, folder: Path) -> Row:
     return replace(row, problems=problems, seconds=round(time.monotonic() - started, 1))
 
 
-def _judged(
-    case: Case, row: Row, report: dict[str, Any], scene: Scene, decided: Sequence[tuple[str, int]]
-) -> list[str]:
+def _judged(case: Case, row: Row, report: RunReport, scene: Scene, decided: Sequence[tuple[str, int]]) -> list[str]:
     """What the report tells that must not be so."""
     found = [f"the fault {kind!r} did not occur" for kind in case.needs if not scene.faults[kind]]
-    if report["ending"]["exit_code"] != TERMINATED:
-        found.append(f"the world ended with {report['ending']['exit_code']}: {report['ending']['reason']}")
+    if report.ending.exit_code != TERMINATED:
+        found.append(f"the world ended with {report.ending.exit_code}: {report.ending.reason}")
     if row.heard_s is None or row.heard_s > case.heard_s:
         found.append(f"an agent was heard again after {row.heard_s} s, {case.heard_s:g} s are allowed")
     if not case.attack:
         return found
-    if report.get("restarts"):
-        found.append(f"processes died: {report['restarts']}")
+    if report.restarts:
+        found.append(f"processes died: {report.restarts}")
     if row.pause_s > MAX_PAUSE:
         found.append(f"the run was held up for {row.pause_s} s")
     if row.secure:
@@ -114,17 +113,17 @@ def _judged(
     return found
 
 
-def _changed(report: dict[str, Any], decided: Sequence[tuple[str, int]]) -> list[str]:
+def _changed(report: RunReport, decided: Sequence[tuple[str, int]]) -> list[str]:
     """What an attack changed although there are certificates."""
     found = []
-    if [(d["agent"], d["action"]) for d in report["decisions"]][: len(decided)] != list(decided):
+    if [(d.agent, d.action) for d in report.decisions][: len(decided)] != list(decided):
         found.append("the decisions are not those of a run that nobody attacked")
-    if report["deaths"]:
-        found.append(f"agents were lost: {report['deaths']}")
-    for agent in report["agents"]:
-        heard = {kind: n for kind, n in agent["counts"].items() if kind in ("unparsed", "other_epoch", "refused")}
+    if report.deaths:
+        found.append(f"agents were lost: {report.deaths}")
+    for agent in report.agents:
+        heard = {kind: n for kind, n in agent.counts.items() if kind in ("unparsed", "other_epoch", "refused")}
         if heard:
-            found.append(f"{agent['name']} heard of it: {heard}")
+            found.append(f"{agent.name} heard of it: {heard}")
     return found
 
 
@@ -132,7 +131,7 @@ def _cost(world: WorldOptions, objective: float, reached: float) -> float | None
     """By how many percent the objective is worse; None where there is nothing to lose."""
     if objective == 0:
         return None
-    worse = objective - reached if world.domain().better == "higher" else reached - objective
+    worse = objective - reached if world.domain.better == "higher" else reached - objective
     return round(100 * worse / abs(objective), 2)
 
 
@@ -183,9 +182,7 @@ def fuzz_row(count: int) -> Row:
 def stops_row(count: int, world: WorldOptions, policy: str) -> Row:
     """As many deployments, each ended in another way or at another moment."""
     started = time.monotonic()
-    names = ("env", "scale", "seed", "objective", "view", "view_options", "run", "ready_timeout")
-    given = {**{name: getattr(world, name) for name in names}, "horizon": ENDLESS}
-    problems = end_many(plan(count), given, policy)
+    problems = end_many(plan(count), replace(world, problem=world.problem.but(horizon=ENDLESS)), policy)
     seconds = round(time.monotonic() - started, 1)
     return Row(case="starts and stops", secure=True, faults={"ended": count}, seconds=seconds, problems=problems)
 

@@ -12,11 +12,11 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 
 from marl_sched.comms.chaos.intruder import Order
 from marl_sched.comms.chaos.proxy import Link
 from marl_sched.comms.launcher import Deployment
+from marl_sched.comms.metrics.report import RunReport
 from marl_sched.comms.options import DeployOptions
 from marl_sched.comms.protocol import keys
 from marl_sched.comms.protocol import messages as wire
@@ -183,7 +183,7 @@ class Scene:
             run=world.run,
             certs=self.deployment.certs,
             name=names[-1] if self.deployment.certs and certificate else "",
-            prefix=world.domain().agent_prefix,
+            prefix=world.domain.agent_prefix,
             channels=self._channels,
             seconds=seconds,
         )
@@ -210,13 +210,13 @@ class Scene:
         self.until(lambda: len(said) > 1, f"hear what an intruder did that was to {what}", 5.0)
         self.faults.update({f"{what} {kind}": n for kind, n in json.loads(said[1]).items()})
 
-    def end(self) -> dict[str, Any]:
+    def end(self) -> RunReport:
         """Interrupt the run; its report."""
         self.deployment.look()
         self.deployment.phase = "over"
         self.deployment.signal(WORLD, signal.SIGTERM)
         report = self.deployment.wait()
-        self.faults.update(report["injected"])
+        self.faults.update(report.injected)
         if self.link is not None:
             self.faults.update(self.link.hit)
         return report

@@ -10,12 +10,12 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from marl_sched.comms.options import WorldOptions
 from marl_sched.comms.process import SIGNALS
 from marl_sched.comms.transport.endpoints import settle_port
 from marl_sched.errors import DeploymentError
@@ -28,6 +28,7 @@ PROGRAM = """
 import json, sys
 from marl_sched.comms.launcher import deploy
 from marl_sched.comms.options import DeployOptions, WorldOptions
+from marl_sched.comms.process import parse_options
 world, policy, raises_at = json.loads(sys.argv[1])
 print("begun", flush=True)
 class CallersOwn(Exception):
@@ -37,7 +38,7 @@ def progress(phase, tick, horizon):
     if phase == raises_at:
         raise CallersOwn
 try:
-    deploy(DeployOptions(world=WorldOptions(**world), policy=policy), progress)
+    deploy(DeployOptions(world=parse_options(json.dumps(world), WorldOptions), policy=policy), progress)
 except CallersOwn:
     pass
 """
@@ -65,12 +66,12 @@ def plan(count: int, seed: int = 0) -> list[Stop]:
     return stops
 
 
-def end_one(stop: Stop, world: dict[str, Any], policy: str, folder: Path) -> list[str]:
+def end_one(stop: Stop, world: WorldOptions, policy: str, folder: Path) -> list[str]:
     """Start a deployment, end it, and say what was left behind or missing, a sentence each."""
     temporary, report = folder / "tmp", folder / "report.json"
     temporary.mkdir(parents=True)
     endpoint = settle_port("tls/127.0.0.1:0")
-    given = {**world, "listen": endpoint, "report": str(report)}
+    given = replace(world, listen=endpoint, report=str(report)).as_json()
     raises_at = stop.moment if stop.number == EXCEPTION else ""
     launcher = subprocess.Popen(
         [sys.executable, "-P", "-c", PROGRAM, json.dumps([given, policy, raises_at])],
@@ -87,7 +88,7 @@ def end_one(stop: Stop, world: dict[str, Any], policy: str, folder: Path) -> lis
     finally:
         launcher.kill()
         launcher.wait()
-    return _found(stop, launcher.returncode, errors, report, temporary, str(world["run"]), endpoint)
+    return _found(stop, launcher.returncode, errors, report, temporary, world.run, endpoint)
 
 
 def _reach(launcher: subprocess.Popen[str], stop: Stop) -> None:
@@ -145,11 +146,11 @@ def processes_of(run: str) -> list[int]:
     return found
 
 
-def end_many(stops: list[Stop], world: dict[str, Any], policy: str, folder: str | None = None) -> list[str]:
+def end_many(stops: list[Stop], world: WorldOptions, policy: str, folder: str | None = None) -> list[str]:
     """What was left behind or missing after all of them; each deployment has a run of its own."""
     found = []
     with tempfile.TemporaryDirectory(prefix="marl_sched-stops-", dir=folder) as inside:
         for number, stop in enumerate(stops):
-            given = {**world, "run": f"{world['run']}-stop-{number}"}
+            given = replace(world, run=f"{world.run}-stop-{number}")
             found += end_one(stop, given, policy, Path(inside) / str(number))
     return found

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import Any
+
+from msgspec import Struct
 
 from marl_sched.comms.metrics.histogram import Histogram
 from marl_sched.comms.protocol.keys import kind_of
@@ -21,11 +22,43 @@ COUNTS = (
 )  # fmt: skip
 
 
+class RunEvent(Struct, frozen=True, kw_only=True):
+    """What befell an agent, or the world: it joined, was lost, was late, ...; it was waited for `waited_s` seconds."""
+
+    time: int
+    agent: str
+    event: str
+    waited_s: float
+
+
+class Volume(Struct, frozen=True):
+    """Messages of one kind, and their bytes."""
+
+    count: int
+    bytes: int
+
+
+class Traffic(Struct, frozen=True, kw_only=True):
+    """What the world said and heard, by kind, and in all."""
+
+    sent: dict[str, Volume]
+    heard: dict[str, Volume]
+    count: int
+    bytes: int
+
+
+class Latency(Struct, frozen=True, kw_only=True):
+    """Median and 99th percentile of the time from a turn to its decision, ms; None if there was no decision."""
+
+    p50: float | None
+    p99: float | None
+
+
 @dataclass
 class RunMetrics:
     """Counts of one run; times in simulated units unless named `_s` or `_ms`."""
 
-    events: list[dict[str, Any]] = field(default_factory=list)  # the first MAX_EVENTS
+    events: list[RunEvent] = field(default_factory=list)  # the first MAX_EVENTS
     latency: Histogram = field(default_factory=Histogram)  # seconds from a turn to its decision
     share_sum: float = 0.0  # of the graph that deciding agents saw
     turns: int = 0
@@ -56,25 +89,24 @@ class RunMetrics:
         self.heard[kind] += 1
         self.heard_bytes[kind] += len(payload)
 
-    def note_event(self, unit: str, time: int, agent: str, event: str, waited_s: float = 0.0) -> None:
+    def note_event(self, time: int, agent: str, event: str, waited_s: float = 0.0) -> None:
         """Note that an agent joined, was lost, was late, ..."""
         if len(self.events) >= MAX_EVENTS:
             self.counts["events_not_kept"] += 1
             return
-        self.events.append({unit: time, "agent": agent, "event": event, "waited_s": round(waited_s, 4)})
+        self.events.append(RunEvent(time=time, agent=agent, event=event, waited_s=round(waited_s, 4)))
 
-    def latency_ms(self) -> dict[str, float | None]:
-        """Median and 99th percentile of the time from a turn to its decision, None if there was no decision."""
-        quantiles = {"p50": self.latency.quantile(0.5), "p99": self.latency.quantile(0.99)}
-        return {name: None if value is None else round(value * 1000, 4) for name, value in quantiles.items()}
+    def latency_ms(self) -> Latency:
+        """Of all decisions so far."""
+        quantiles = (self.latency.quantile(share) for share in (0.5, 0.99))
+        median, high = (None if value is None else round(value * 1000, 4) for value in quantiles)
+        return Latency(p50=median, p99=high)
 
-    def messages(self) -> dict[str, Any]:
+    def messages(self) -> Traffic:
         """Counts and bytes by kind, both ways, with totals."""
-        ways = {"sent": (self.sent, self.sent_bytes), "heard": (self.heard, self.heard_bytes)}
-        out: dict[str, Any] = {
-            way: {kind: {"count": counts[kind], "bytes": sizes[kind]} for kind in sorted(counts)}
-            for way, (counts, sizes) in ways.items()
-        }
-        out["count"] = self.sent.total() + self.heard.total()
-        out["bytes"] = self.sent_bytes.total() + self.heard_bytes.total()
-        return out
+        return Traffic(
+            sent={kind: Volume(self.sent[kind], self.sent_bytes[kind]) for kind in sorted(self.sent)},
+            heard={kind: Volume(self.heard[kind], self.heard_bytes[kind]) for kind in sorted(self.heard)},
+            count=self.sent.total() + self.heard.total(),
+            bytes=self.sent_bytes.total() + self.heard_bytes.total(),
+        )

@@ -10,6 +10,7 @@ from marl_sched.envs.airme.simulator import DEFAULT_HORIZON, AirmeSimulator
 from marl_sched.envs.airme.state import OBJECTIVES
 from marl_sched.envs.airme.views import VIEWS
 from marl_sched.plugins import lazy
+from marl_sched.privileged import PrivilegedInfo
 
 AIRME = Domain(
     name="airme",
@@ -31,7 +32,9 @@ AIRME = Domain(
     reference="corrective-published",  # section 6.5.2
     schedulers="marl_sched.agents.airme.schedulers:RULES",
     benchmarks=lazy("marl_sched.agents.airme.bench:benchmarks"),
+    hidden_info=PrivilegedInfo.FAILURE_MODEL,
     bound="marl_sched.agents.airme.bound.relaxation",
+    bound_info=PrivilegedInfo.FAILURE_MODEL | PrivilegedInfo.TIME_LEFT,
     demo=Demo(
         scale="small",
         objective="profit",

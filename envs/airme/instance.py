@@ -78,6 +78,10 @@ class AirmeInstance:
         """Number of planes, the null plane not counted."""
         return len(self.kind)
 
+    def __repr__(self) -> str:
+        """One line: sizes and identity."""
+        return f"AirmeInstance({self.n_planes} planes, {self.n_crews} crews, {self.identity:016x})"
+
     @cached_property
     def identity(self) -> int:
         """A 64-bit hash of the content, names left out: the instance's name in counter-based randomness."""

@@ -56,6 +56,12 @@ class SchedulingEnvironment(SavesState):
         self.state_space = graph_space(simulator.arrays)
         self.agents = []
 
+    def __repr__(self) -> str:
+        """One line: the class and the problem."""
+        return f"{type(self).__name__}({self._single.problem!r})"
+
+    __str__ = __repr__  # PettingZoo's own would tell the class alone
+
     def _present(self) -> list[str]:
         """The agents of an episode that begins now."""
         return self.possible_agents[: None if self._pad_agents else self.simulator.n_agents[0]]

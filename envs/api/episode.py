@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from marl_sched.domain import Domain
-from marl_sched.envs.api.options import as_domain, as_instance
+from marl_sched.envs.api.options import OF_DOMAIN, DefaultScale, as_problem
 from marl_sched.errors import IllegalActionError, InvalidOptionError, require
 from marl_sched.graph import ACTION_MASK
-from marl_sched.noise import Split, as_seed, episode_number, fresh_seed, instance_generator
+from marl_sched.noise import Split, as_seed
+from marl_sched.problem import as_instance
 from marl_sched.simulation import Observation
 
 # PettingZoo's conformance kit passes {"options": 1} to every reset and expects to be heard out.
@@ -29,15 +30,17 @@ class SingleEpisode:
 
     Args:
         domain: a registered domain or its name.
-        scale: of generated instances, and whose largest instance sets the padding; None pads to `instance`.
+        scale: of generated instances, and whose largest instance sets the padding; by default the domain's smallest.
+            None pads to `instance`.
         instance: a fixed instance or the path of its file.
-        view, objective, horizon: as every domain's simulator takes them; None is the domain's default.
+        view, objective, horizon: see Problem; None is the domain's default.
         seed: of instances and noise until a reset gives another; None draws one from the operating system's entropy.
         split: "train", "validation" or "test".
         render_mode: one of the domain's, or None.
         options: further options of the domain's simulator; unknown ones raise TypeError.
 
     Attributes:
+        problem: what is played, of one instance; its seed is that of the environment's making.
         simulator: the TurnSimulator, with B = 1.
         position: the seed and the number of the running episode, -1 before the first reset.
         metadata: what PettingZoo and Gymnasium ask of a class.
@@ -47,7 +50,7 @@ class SingleEpisode:
         self,
         domain: str | Domain,
         *,
-        scale: str | None = "small",
+        scale: str | DefaultScale | None = OF_DOMAIN,
         instance: Any = None,
         view: Any = None,
         objective: str | None = None,
@@ -57,12 +60,21 @@ class SingleEpisode:
         render_mode: str | None = None,
         **options: Any,
     ) -> None:
-        self.domain = as_domain(domain)
+        self.problem = as_problem(
+            domain,
+            scale=scale,
+            instances=None if instance is None else [instance],
+            count=1,
+            seed=seed,
+            options=options,
+            view=view,
+            objective=objective,
+            horizon=horizon,
+            split=split,
+        )
+        self.domain = self.problem.domain
         if render_mode is not None:
             require(f"render mode of {self.domain.name}", render_mode, self.domain.render)
-        if scale is None and instance is None:
-            raise InvalidOptionError("scale: expected a scale's name where no instance is given")
-        self.scale = scale if scale is None else self.domain.require_scale(scale)
         self.render_mode = render_mode
         self.metadata = {
             "name": f"{self.domain.name}_v0",
@@ -70,28 +82,13 @@ class SingleEpisode:
             "render_fps": 10,
             "is_parallelizable": False,
         }
-        self._fixed = None if instance is None else as_instance(self.domain, instance)
-        self.split = split
-        self.position = (fresh_seed() if seed is None else as_seed(seed)), -1
-        self.simulator = self.domain.make_simulator(
-            [self._instance(0)],
-            view=self.domain.make_view(view),
-            objective=self.domain.objectives[0] if objective is None else objective,
-            horizon=self.domain.default_horizon if horizon is None else horizon,
-            seed=self.position[0],
-            pad=self.scale,
-            **dict(self.domain.render_options.get(str(render_mode), {})),
-            **options,
-        )
+        self.position = self.problem.seed, -1
+        drawn = {n: v for n, v in self.domain.render_options.get(str(render_mode), {}).items() if n not in options}
+        self.simulator = self.problem.simulator(**drawn)
         self._agent = np.zeros(1, np.int64)
         self._action = np.zeros(1, np.int64)
         specs = self.simulator.arrays
         self._layout = [(name, (1, *spec.shape), spec.dtype) for name, spec in specs.items()]
-
-    def _instance(self, episode: int) -> Any:
-        if self._fixed is not None:
-            return self._fixed
-        return self.domain.generate(str(self.scale), instance_generator(self.position[0], episode, self.split))
 
     def reset(self, seed: int | None, options: Mapping[str, Any] | None) -> None:
         """Start the next episode, or episode 0 of `seed`.
@@ -105,8 +102,8 @@ class SingleEpisode:
         given = as_instance(self.domain, options["instance"]) if "instance" in options else None
         self.position = (as_seed(seed), 0) if seed is not None else (self.position[0], self.position[1] + 1)
         seed, episode = self.position
-        instance = self._instance(episode) if given is None else given
-        self.simulator.reset(seed=seed, instances=[instance], episodes=[episode_number(episode, self.split)])
+        instance = self.problem.instance(episode, seed) if given is None else given
+        self.simulator.reset(seed=seed, instances=[instance], episodes=self.problem.episode_numbers([episode]))
 
     @property
     def over(self) -> bool:

@@ -23,7 +23,8 @@ class SchedulingEnv(SavesState, gymnasium.Env):
     What a joint action is and which time a step takes is the domain's (`Domain.central`): in AirME an action for
     each crew and an hour. The observation is the whole graph under the full view, with the first agent that has
     to act in the place of the acting one, or agent 0 while all are busy. Illegal parts of an action inside the
-    space idle their agents, whom the info lists under `illegal`; the info also holds `time`.
+    space idle their agents, whom the info lists under `illegal`; the info also holds `time`, and under an
+    objective from outside the `reward_parts`.
 
     Args:
         domain: a registered domain or its name.
@@ -60,6 +61,12 @@ class SchedulingEnv(SavesState, gymnasium.Env):
             self.observation_space = vector_space(self._vector)
             self.action_space = spaces.MultiDiscrete(self._joint.nvec.ravel())
 
+    def __repr__(self) -> str:
+        """One line: the class and the problem."""
+        return f"{type(self).__name__}({self._single.problem!r})"
+
+    __str__ = __repr__  # Gymnasium's own would tell the class alone
+
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start episode 0 of `seed`, or the next episode; `options={"instance": ...}` gives its instance."""
         super().reset(seed=seed)
@@ -75,7 +82,7 @@ class SchedulingEnv(SavesState, gymnasium.Env):
             raise IllegalActionError("step: the episode is over, call reset()")
         if not self.action_space.contains(action):
             raise IllegalActionError(f"joint action: expected one in {self.action_space}, got {_shown(action)}")
-        reward, info = self.central.play(self.simulator, np.reshape(action, self._joint.shape))
+        reward, info = self.simulator.play_jointly(self.central, np.reshape(action, self._joint.shape))
         terminated, truncated = bool(self.simulator.terminated[0]), bool(self.simulator.truncated[0])
         return self._observe(), reward, terminated, truncated, self._info() | info
 
@@ -92,7 +99,8 @@ class SchedulingEnv(SavesState, gymnasium.Env):
         return flattened(graph, self._vector) if self._vector else graph
 
     def _info(self) -> dict[str, Any]:
-        return {"time": int(self.simulator.time[0])}
+        parts = self._single.reward_parts()
+        return {"time": int(self.simulator.time[0]), **({"reward_parts": parts} if parts else {})}
 
     def render(self) -> Any:
         """The picture of the chosen render mode: str for `ansi`, uint8 (H, W, 3) for `rgb_array`."""

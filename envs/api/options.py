@@ -1,21 +1,68 @@
-"""What users pass to an environment, brought to what a simulator takes; every refusal names the option."""
+"""What users pass to an environment, brought to a `Problem`; every refusal names the option."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, TypedDict
+from collections.abc import Mapping, Sequence
+from enum import Enum
+from typing import Any, Final, TypedDict
 
 from marl_sched.domain import Domain, get_domain
 from marl_sched.envs.api.layout import MaskPlace
-from marl_sched.noise import Split
-from marl_sched.problem import as_instance
+from marl_sched.errors import InvalidOptionError
+from marl_sched.noise import Split, fresh_seed
+from marl_sched.problem import Problem
 
-__all__ = ["ENVIRONMENT_DEFAULTS", "EnvironmentOptions", "as_domain", "as_instance", "with_defaults"]
+__all__ = ["ENVIRONMENT_DEFAULTS", "OF_DOMAIN", "DefaultScale", "EnvironmentOptions", "as_problem", "with_defaults"]
 
 
-def as_domain(domain: str | Domain) -> Domain:
-    """A domain from its name, or itself; UnknownNameError lists the known names."""
-    return domain if isinstance(domain, Domain) else get_domain(domain)
+class DefaultScale(Enum):
+    """The default of an environment's `scale`, where None already means: pad to the given instances."""
+
+    OF_DOMAIN = "the domain's smallest"
+
+
+OF_DOMAIN: Final = DefaultScale.OF_DOMAIN
+
+
+def as_problem(
+    domain: str | Domain,
+    *,
+    scale: str | DefaultScale | None,
+    instances: Sequence[Any] | None,
+    count: int,
+    seed: int | None,
+    options: Mapping[str, Any],
+    **arguments: Any,
+) -> Problem:
+    """The problem that an environment's options state.
+
+    Args:
+        domain: a registered domain or its name.
+        scale: of generated instances, and whose largest instance sets the padding; None pads to `instances`.
+        instances: objects or files; None: some of the scale are drawn.
+        count: how many are drawn.
+        seed: None draws one from the operating system's entropy.
+        options: of the domain's simulator.
+        arguments: what else `Problem` takes.
+
+    Raises TypeError for an option that the simulator does not have, otherwise as Problem.
+    """
+    domain = domain if isinstance(domain, Domain) else get_domain(domain)
+    if scale is None and instances is None:
+        raise InvalidOptionError("scale: expected a scale's name where no instance is given")
+    for name in options:
+        if name not in domain.simulator_options:
+            raise TypeError(f"unknown option {name!r}; known: {', '.join(domain.simulator_options) or 'none'}")
+    scale = domain.default_scale if isinstance(scale, DefaultScale) else scale
+    source = {"instances": instances} if instances is not None else {"scale": scale, "count": count}
+    return Problem(
+        domain,
+        **source,
+        pad=scale,
+        seed=fresh_seed() if seed is None else seed,
+        options=options,
+        **arguments,
+    )
 
 
 class EnvironmentOptions(TypedDict, total=False):

@@ -34,12 +34,13 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, TensorSpec, Un
 from torchrl.envs import EnvBase
 
 from marl_sched.domain import Domain
-from marl_sched.envs.api.options import as_domain, as_instance
+from marl_sched.envs.api.options import OF_DOMAIN, DefaultScale, as_problem
 from marl_sched.envs.api.sampling import idle_illegal
 from marl_sched.envs.api.saving import SavedEnvironment, SavesState
 from marl_sched.errors import IllegalActionError, InvalidOptionError
 from marl_sched.graph import ACTION_MASK, ArraySpec
-from marl_sched.noise import Split, as_seed, episode_number, fresh_seed
+from marl_sched.noise import Split
+from marl_sched.problem import as_instance
 
 _CPU = torch.device("cpu")
 
@@ -58,26 +59,31 @@ class SchedulingTorchRL(SavesState, EnvBase):
     Args:
         domain: a registered domain or its name.
         batch_size: number of rows B; may be left out where `instances` are given.
-        scale: of generated instances, and whose largest instance sets the padding; None pads to `instances`.
+        scale: of generated instances, and whose largest instance sets the padding; by default the domain's smallest.
+            None pads to `instances`.
         instances: one per row, or files of such.
         source: gives a row's instance at each of its resets, and once more when the environment is made.
-        view, objective, horizon: as every domain's simulator takes them; None is the domain's default.
+        view, objective, horizon: see Problem; None is the domain's default.
         seed: of instances and noise; `set_seed` sets another, for each row from its next reset on. None draws one
             from the operating system's entropy. Random actions follow `torch.manual_seed`, as everywhere in TorchRL.
         split: "train", "validation" or "test".
         device: where tensors live; the simulator runs on the CPU.
         options: further options of the domain's simulator; unknown ones raise TypeError.
+
+    Attributes:
+        problem: what is played, an instance for each row; `set_seed` puts another in its place.
+        simulator: the TurnSimulator of all rows.
     """
 
     batch_locked = True
-    changing: ClassVar[tuple[str, ...]] = ("_seed", "_count")
+    changing: ClassVar[tuple[str, ...]] = ("problem", "_count")
 
     def __init__(
         self,
         domain: str | Domain,
         *,
         batch_size: int | None = None,
-        scale: str | None = "small",
+        scale: str | DefaultScale | None = OF_DOMAIN,
         instances: Sequence[Any] | None = None,
         source: InstanceSource | None = None,
         view: Any = None,
@@ -88,30 +94,34 @@ class SchedulingTorchRL(SavesState, EnvBase):
         device: torch.device | str = "cpu",
         **options: Any,
     ) -> None:
-        _check(batch_size, scale, instances, source)
+        _check(batch_size, instances, source)
         rows = len(instances) if instances is not None else int(batch_size or 1)
         super().__init__(device=torch.device(device), batch_size=torch.Size([rows]))
-        self.domain = as_domain(domain)
-        self.scale = scale if scale is None else self.domain.require_scale(scale)
-        self._source = source
-        self._given = None if instances is None else [as_instance(self.domain, i) for i in instances]
-        self.split = split
-        self._set_seed(fresh_seed() if seed is None else seed)
-        self.simulator = self.domain.make_simulator(
-            self._instances(range(rows), 0),
-            view=self.domain.make_view(view),
-            objective=self.domain.objectives[0] if objective is None else objective,
-            horizon=self.domain.default_horizon if horizon is None else horizon,
-            seed=self._seed,
-            pad=self.scale,
-            **options,
+        self.problem = as_problem(
+            domain,
+            scale=scale,
+            instances=instances,
+            count=rows,
+            seed=seed,
+            options=options,
+            view=view,
+            objective=objective,
+            horizon=horizon,
+            split=split,
         )
+        self.domain, self._source = self.problem.domain, source
+        self._set_seed(self.problem.seed)
+        self.simulator = self.problem.simulator_of(self._instances(range(rows), 0))
         self._mask = np.ones((rows, self.simulator.max_actions), bool)  # of the choices to be made now
         self._allowed, self._illegal = np.zeros(rows, np.int64), np.zeros(rows, bool)
         self._scratch = self.simulator.new_observation()
         dtypes = {name: _torch_dtype(s.dtype) for name, s in self.simulator.arrays.items()} | {ACTION_MASK: torch.bool}
         self._layout = [(name, (rows, *s.shape), dtypes[name]) for name, s in self.simulator.arrays.items()]
         self._make_specs()
+
+    def __repr__(self) -> str:
+        """One line: the class, the rows and the problem."""
+        return f"{type(self).__name__}({self.batch_size[0]} envs, {self.problem!r}, {self.device})"
 
     def _make_specs(self) -> None:
         batch = self.batch_size
@@ -142,30 +152,28 @@ class SchedulingTorchRL(SavesState, EnvBase):
         self._link_mask()
 
     def _set_seed(self, seed: int | None) -> None:
-        self._seed = as_seed(seed)
+        self.problem = self.problem.but(seed=seed)
         self._count = np.full(self.batch_size[0], -1, np.int64)  # of each row's running episode
         self._find_instances()
 
     def _find_instances(self) -> None:
         """The instances that the seed's rows play, and how rows that share one take turns in counting episodes."""
         if self._source is None:
-            rows = self.batch_size[0]
-            self._fixed = self._given or self.domain.instances(str(self.scale), rows, self._seed, self.split)
-            self._first, self._stride = _turns([instance.identity for instance in self._fixed])
+            self._first, self._stride = _turns([instance.identity for instance in self.problem.instances])
         else:
             self._first, self._stride = np.arange(self.batch_size[0]), np.full(self.batch_size[0], self.batch_size[0])
 
     def load_state(self, saved: SavedEnvironment) -> None:
         """Return to a saved state; see SavesState. `current` gives the tensordict with which to go on."""
-        seed = self._seed
+        seed = self.problem.seed
         super().load_state(saved)
-        if self._seed != seed:
+        if self.problem.seed != seed:
             self._find_instances()
         self.current()  # for the mask
 
     def _instances(self, rows: Sequence[int] | np.ndarray, count: int | np.ndarray) -> list[Any]:
         if self._source is None:
-            return [self._fixed[b] for b in rows]
+            return [self.problem.instances[b] for b in rows]
         counts = np.broadcast_to(count, len(rows))
         return [as_instance(self.domain, self._source(int(b), int(n))) for b, n in zip(rows, counts, strict=True)]
 
@@ -200,9 +208,9 @@ class SchedulingTorchRL(SavesState, EnvBase):
         self._count[envs] += 1
         self.simulator.reset(
             envs,
-            seed=self._seed,
+            seed=self.problem.seed,
             instances=self._instances(np.flatnonzero(envs), self._count[envs]),
-            episodes=[episode_number(int(n), self.split) for n in (self._first + self._count * self._stride)[envs]],
+            episodes=self.problem.episode_numbers((self._first + self._count * self._stride)[envs]),
         )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -253,7 +261,7 @@ class SchedulingTorchRL(SavesState, EnvBase):
         return out if self.device == _CPU else out.to(self.device)
 
 
-def _check(batch_size: int | None, scale: str | None, instances: Any, source: Any) -> None:
+def _check(batch_size: int | None, instances: Any, source: Any) -> None:
     """Raise InvalidOptionError where the options of the constructor contradict each other."""
     if instances is None and (batch_size is None or batch_size < 1):
         raise InvalidOptionError(f"batch_size: expected at least 1 row, got {batch_size}")
@@ -261,8 +269,6 @@ def _check(batch_size: int | None, scale: str | None, instances: Any, source: An
         raise InvalidOptionError(f"instances: expected one per row ({batch_size}), got {len(instances)}")
     if instances is not None and source is not None:
         raise InvalidOptionError("source: expected either instances or a source of them, got both")
-    if scale is None and instances is None:
-        raise InvalidOptionError("scale: expected a scale's name where no instances are given")
 
 
 def _turns(identities: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:

@@ -199,6 +199,13 @@ class MurseInstance:
             near = apart <= self.safety_distance
         return near & ~np.eye(self.n_tasks, dtype=bool)
 
+    def __repr__(self) -> str:
+        """One line: sizes and identity."""
+        return (
+            f"MurseInstance({self.n_tasks} tasks, {self.n_robots} robots, {self.n_humans} humans, "
+            f"{self.n_rounds} rounds, {self.identity:016x})"
+        )
+
     @cached_property
     def identity(self) -> int:
         """A 64-bit hash of tasks, team and constraints: the instance's name in counter-based randomness.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import uuid
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -47,12 +47,7 @@ class Team:
         view = self.view or next((kind for kind in domain.views if kind != "full"), "full")
         problem = options.state_problem(self.env, self.own, scale=self.scale, view=view, seed=self.seed, episodes=1)
         return WorldOptions(
-            env=self.env,
-            scale=problem.scale or next(iter(domain.scales)),
-            seed=self.seed,
-            objective=problem.objective,
-            view=problem.view.kind,
-            view_options=asdict(problem.view),
+            problem=problem,
             run=f"chaos-{uuid.uuid4().hex[:8]}",
             listen="tls/127.0.0.1:0",
             deadline=5.0,

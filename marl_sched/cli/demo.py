@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -13,9 +12,11 @@ from marl_sched.cli.selection import Resolved, create_schedulers
 from marl_sched.errors import DeploymentError, InvalidOptionError
 
 if TYPE_CHECKING:
+    from marl_sched.comms.metrics.report import RunReport
     from marl_sched.domain import Demo, Domain
     from marl_sched.problem import Problem
     from marl_sched.simulation import TurnSimulator
+    from marl_sched.train.evaluation.results import Results
 
 
 def add_to(app: typer.Typer) -> None:
@@ -50,7 +51,7 @@ def demo(
     print_report(report)
     episodes = _same_episode(problem, policy, shown)
     replay, *_ = episodes.values()
-    require_equal(report[problem.objective], problem, replay)
+    require_equal(report.series[problem.objective], problem, replay)
     typer.echo("The same episode played in one process is the same to the last bit.")
 
     typer.echo(f"\n2. {shown.instances} other instances x {shown.episodes} episodes: this view, and central schedulers")
@@ -61,7 +62,7 @@ def demo(
     print_scores(full)
 
     for name, table in (("local", local), ("full", full)):
-        write_json(out / f"results-{name}-view.json", table)
+        write_json(out / f"results-{name}-view.json", table.as_json())
     draw_scores(out / "scores.png", local, full)
     draw_timelines(out / "timelines.png", domain, episodes, problem.objective)
     for path in sorted(out.iterdir()):
@@ -92,19 +93,13 @@ def deployed_problem(domain: Domain, policy: str) -> Problem:
     )
 
 
-def _deploy(policy: str, problem: Problem, path: Path) -> dict[str, Any]:
+def _deploy(policy: str, problem: Problem, path: Path) -> RunReport:
     from marl_sched.cli.deployment import progress_bar
     from marl_sched.comms.launcher import deploy
     from marl_sched.comms.options import DeployOptions, WorldOptions
 
     world = WorldOptions(
-        env=problem.domain.name,
-        scale=str(problem.scale),
-        seed=problem.seed,
-        horizon=problem.horizon,
-        objective=problem.objective,
-        view=problem.view.kind,
-        view_options=asdict(problem.view),
+        problem=problem,
         listen="tls/127.0.0.1:0",
         report=str(path),
     )
@@ -140,7 +135,7 @@ def _same_episode(problem: Problem, policy: str, shown: Demo) -> dict[str, TurnS
     }
 
 
-def _compare(problem: Problem, names: list[str]) -> dict[str, Any]:
+def _compare(problem: Problem, names: list[str]) -> Results:
     from marl_sched.cli.evaluation import play
 
     return play(Resolved(problem, create_schedulers(problem.domain, names)), None)

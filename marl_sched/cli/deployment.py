@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -15,6 +15,7 @@ from marl_sched.cli.grouped import DOMAIN_OPTIONS, OwnOptions, takes
 from marl_sched.errors import InvalidOptionError
 
 if TYPE_CHECKING:
+    from marl_sched.comms.metrics.report import AgentReport, RunReport
     from marl_sched.comms.options import WorldOptions
     from marl_sched.problem import Problem
 
@@ -114,18 +115,8 @@ class Plant:
         from marl_sched.comms.options import WorldOptions
 
         options.check_output(json)
-        problem = self.problem()
-        if problem.options:
-            raise InvalidOptionError(f"{', '.join(problem.options)}: a deployed world has no options of the simulator")
         return WorldOptions(
-            env=self.env,
-            scale=problem.scale or next(iter(problem.domain.scales)),
-            instance=str(self.instance or ""),
-            seed=self.seed,
-            horizon=problem.horizon,
-            objective=problem.objective,
-            view=problem.view.kind,
-            view_options=asdict(problem.view),
+            problem=self.problem(),
             run=self.run,
             listen=listen,
             certs=str(self.certs or ""),
@@ -261,7 +252,7 @@ def replay(
         raise InvalidOptionError(f"{log}: expected a run's log, there is no such file")
     report = play_log(log, picture)
     if json is not None:
-        write_json(json, report)
+        write_json(json, report.as_json())
     print_report(report)
 
 
@@ -317,37 +308,34 @@ def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
         yield tell
 
 
-def finish(report: dict[str, Any]) -> None:
+def finish(report: RunReport) -> None:
     """Print the end of a run, and exit as it ended."""
     print_report(report)
-    if report["ending"]["exit_code"]:
-        raise typer.Exit(report["ending"]["exit_code"])
+    if report.ending.exit_code:
+        raise typer.Exit(report.ending.exit_code)
 
 
-def print_report(report: dict[str, Any]) -> None:
+def print_report(report: RunReport) -> None:
     """The end of a run in a few lines."""
-    latency, messages = report["latency_ms"], report["messages"]
-    if report["ending"]["kind"] != "complete":
-        typer.echo(f"the run did not come to its end: {report['ending']['reason']}")
-    typer.echo(
-        f"{report['time']} {report['unit']}, {len(report['agents'])} agents, {len(report['decisions'])} decisions"
-    )
-    typer.echo(f"M1 ({report['objective']}): {report['M1']:.4f}")
-    _print_shares(report["agents"])
-    if "from_log" in report:
+    latency, messages = report.latency_ms, report.messages
+    if report.ending.kind != "complete":
+        typer.echo(f"the run did not come to its end: {report.ending.reason}")
+    typer.echo(f"{report.time} {report.unit}, {len(report.agents)} agents, {len(report.decisions)} decisions")
+    typer.echo(f"M1 ({report.objective}): {report.M1:.4f}")
+    _print_shares(report.agents)
+    if report.from_log is not None:
         return
-    typer.echo(f"{messages['count']} messages, {messages['bytes']} bytes")
-    if latency["p50"] is not None:
-        typer.echo(f"decision latency: p50 {latency['p50']:.2f} ms, p99 {latency['p99']:.2f} ms")
-    for death in report["deaths"]:
-        where = ", ".join(f"{name} {value}" for name, value in death.items())
-        typer.echo(f"lost: {where}")
+    typer.echo(f"{messages.count} messages, {messages.bytes} bytes")
+    if latency.p50 is not None and latency.p99 is not None:
+        typer.echo(f"decision latency: p50 {latency.p50:.2f} ms, p99 {latency.p99:.2f} ms")
+    for death in report.deaths:
+        typer.echo(f"lost: {report.time_unit} {death.time}, {death.agent}, {death.event}, waited {death.waited_s} s")
 
 
-def _print_shares(agents: list[dict[str, Any]]) -> None:
+def _print_shares(agents: list[AgentReport]) -> None:
     """How evenly the agents worked, where the environment counts that."""
-    shares = {one["name"]: one["figures"].get("utilisation") for one in agents}
-    if not agents or None in shares.values():
+    shares = {one.name: one.figures["utilisation"] for one in agents if "utilisation" in one.figures}
+    if not shares:
         return
     least, most = min(shares, key=shares.__getitem__), max(shares, key=shares.__getitem__)
     typer.echo(

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import msgspec
 import typer
 
 from marl_sched.cli import options
@@ -16,12 +17,14 @@ from marl_sched.errors import InvalidOptionError
 
 if TYPE_CHECKING:
     from marl_sched.problem import Problem
+    from marl_sched.train.evaluation.results import Results
 
 _SELECTORS = (
     f"--env {options.DEFAULT_ENV} --scale small --instances 100 --episodes 10 --schedulers corrective,condition"
 )
 
 
+BECAME_SLOWER = 1  # exit code of `bench --against`
 SaveSchedules = Annotated[
     Path | None, typer.Option("--save-schedules", metavar="DIR", help="Write every round's schedule here, as JSON.")
 ]
@@ -61,7 +64,7 @@ def evaluate(
     if agents:
         print_agents(results, format, stderr=json == STDOUT)
     if json is not None:
-        write_json(json, results)
+        write_json(json, results.as_json())
 
 
 def compare(
@@ -98,7 +101,7 @@ def compare(
         print_agents(results, format, stderr=json == STDOUT)
     for path in (out / "results.json", json):
         if path is not None:
-            write_json(path, results)
+            write_json(path, results.as_json())
     typer.echo(out / "results.json")
     typer.echo(draw_scores(out / "scores.png", results))
     problem = resolved.problem
@@ -106,8 +109,8 @@ def compare(
     typer.echo(draw_timelines(out / "timelines.png", problem.domain, episodes, problem.objective))
 
 
-def play(resolved: Resolved, baseline: str | None, schedules: Path | None = None) -> dict[str, Any]:
-    """Evaluate what was selected, and tell on stderr how far it is; schema 2.
+def play(resolved: Resolved, baseline: str | None, schedules: Path | None = None) -> Results:
+    """Evaluate what was selected, and tell on stderr how far it is.
 
     `schedules` is a folder for the schedules of every round, with a folder for each scheduler; None: none are kept.
     """
@@ -127,7 +130,7 @@ def play(resolved: Resolved, baseline: str | None, schedules: Path | None = None
             progress=tell,
             ended=None if schedules is None else _keeper(resolved.problem, schedules),
         )
-        return table.as_json()
+        return table.results()
 
 
 def _keeper(problem: Problem, folder: Path) -> Callable[[str, Any, range], None]:
@@ -156,16 +159,28 @@ def bench(
     batch: Annotated[
         int | None, typer.Option("--batch", min=1, help="Envs of what is measured in batches (default 1024).")
     ] = None,
+    against: Annotated[
+        Path | None,
+        typer.Option("--against", metavar="FILE", help="Earlier figures; ends with 1 if one is 10 percent slower."),
+    ] = None,
 ) -> None:
-    """Measure how fast the simulator, its environment APIs and the policy are on this machine, on one thread."""
+    """Measure how fast the simulator, its environment APIs and the policy are on this machine, on one thread.
+
+    `--against` holds the figures against those that `--json` wrote before, each in units of a calibration that is
+    measured beside them, so that the machines need not be the same.
+    """
     from marl_sched.cli.tables import print_bench
     from marl_sched.domain import get_domain
     from marl_sched.files import STDOUT, write_json
+    from marl_sched.train.bench import SLOWER, read_bench
     from marl_sched.train.bench import bench as measure
 
     options.check_output(json)
+    earlier = None if against is None else read_bench(against)
     with told_of_compilation():
-        figures = measure(get_domain(env), repeats=repeats, batch=batch)
-    print_bench(figures, stderr=json == STDOUT)
+        now = measure(get_domain(env), repeats=repeats, batch=batch)
+    print_bench(now, earlier, stderr=json == STDOUT)
     if json is not None:
-        write_json(json, figures)
+        write_json(json, msgspec.to_builtins(now))
+    if earlier is not None and any(ratio > SLOWER for ratio in now.against(earlier).values()):
+        raise typer.Exit(BECAME_SLOWER)

@@ -11,31 +11,45 @@ import sys
 from pathlib import Path
 
 import pytest
+from msgspec import structs
 
 from marl_sched.cli.tables import FORMATS, print_scores
 from marl_sched.errors import InvalidOptionError, UnknownNameError
+from marl_sched.privileged import PrivilegedInfo
+from marl_sched.problem import Problem
+from marl_sched.statistics import PairedDifference, Summary
+from marl_sched.train.evaluation.results import Baseline, Measure, Reference, Results, SchedulerResults
 
 
-def summary(mean):
+def intervals(mean):
     return {
-        "mean": mean,
-        "std": 0.0123,
-        "iqm": mean + 0.001,
-        "ci95_such_instances": [mean - 0.1, mean + 0.1],
-        "ci95_these_instances": [mean - 0.01, mean + 0.01],
+        "ci95_such_instances": (mean - 0.1, mean + 0.1),
+        "ci95_these_instances": (mean - 0.01, mean + 0.01),
     }
 
 
+def summary(mean):
+    return Summary(mean=mean, std=0.0123, iqm=mean + 0.001, **intervals(mean))
+
+
 def results(name="a-scheduler-with-a-name-that-is-longer-than-any-terminal-has-columns"):
-    row = {"M1": summary(0.7123), "difference": summary(0.0456), "M2": summary(12.3), "revenue": summary(0.8),
-           "needs": "", "local": True, "visible_share": 1.0}  # fmt: skip
-    better = {**row, "M1": summary(0.9876)}
-    return {
-        "env": "airme", "scale": "small", "objective": "profit", "unit": "hours", "horizon": 720, "better": "higher",
-        "instances": 3, "episodes": 2, "seed": 0, "view": {"kind": "full", "visible_share": 1.0, "local": True},
-        "baseline": {"scheduler": "corrective", "view": {"kind": "full"}}, "reference": "corrective",
-        "schedulers": {name: row, "x": better},
-    }  # fmt: skip
+    row = SchedulerResults(
+        M1=summary(0.7123),
+        scores=[[0.7, 0.7], [0.7, 0.7], [0.7, 0.7]],
+        M2=summary(12.3),
+        measures={one: Measure(mean=0.8, summary=summary(0.8)) for one in ("profit", "revenue")},
+        difference=PairedDifference(mean=0.0456, std=0.0123, p=None, **intervals(0.0456)),
+        visible_share=1.0,
+        privileged_info=PrivilegedInfo.NONE,
+        seconds=1.0,
+    )
+    return Results(
+        problem=Problem("airme", count=3, episodes=2),
+        baseline=Baseline(scheduler="corrective", view={"kind": "full"}),
+        reference=Reference(scheduler="corrective", M1=summary(0.6)),
+        schedulers={name: row, "x": structs.replace(row, M1=summary(0.9876))},
+        by_instance=[],
+    )
 
 
 @pytest.mark.parametrize("columns", ["0", "20", "60", "80", "200"])
@@ -65,7 +79,7 @@ def test_csv_has_a_column_for_every_number_and_the_best_first(capsys):
 
 def test_json_is_the_results(capsys):
     print_scores(results(), "json")
-    assert json.loads(capsys.readouterr().out) == results()
+    assert json.loads(capsys.readouterr().out) == json.loads(json.dumps(results().as_json()))
 
 
 def test_markdown_and_latex_hold_whole_names_and_all_measures(capsys):
@@ -73,7 +87,7 @@ def test_markdown_and_latex_hold_whole_names_and_all_measures(capsys):
         print_scores(results(), style)
         printed = capsys.readouterr().out
         assert mark in printed
-        assert next(iter(results()["schedulers"])) in printed
+        assert next(iter(results().schedulers)) in printed
         assert "revenue" in printed
         assert "0.7123 ± 0.012" in printed
 

@@ -50,9 +50,8 @@ def test_the_bench_measures_schedules_and_edf(run, tmp_path, monkeypatch):
     for name, value in (("BATCH", 3), ("_AEC_TURNS", 20), ("_TORCHRL_STEPS", 2), ("_POLICY_DECISIONS", 2)):
         monkeypatch.setattr(bench, name, value)
     assert run("bench", "--env", "murse", "--repeats", 1, "--json", tmp_path / "b.json").code == 0
-    figures = json.loads((tmp_path / "b.json").read_text())
-    names = ("schedule_us_b3", "edf_large_ms", "aec_turns_per_s", "torchrl_decisions_per_s")
-    assert all(figures[name] > 0 and figures["meaning"][name] for name in names)
+    figures = bench.read_bench(tmp_path / "b.json").figures
+    assert {"schedule_us_b3", "edf_large_ms", "aec_turns_per_s", "torchrl_decisions_per_s"} < set(figures)
 
 
 def test_a_hopeless_instance_is_told_in_one_line_on_stderr(run, tmp_path):

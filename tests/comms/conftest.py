@@ -12,11 +12,12 @@ import pytest
 from marl_sched.agents.registry import create_scheduler
 from marl_sched.comms.inproc import Bus, Threads
 from marl_sched.comms.options import WorldOptions
+from marl_sched.domain import get_domain
 
 
 def played_in_process(options: WorldOptions, policies: list[str]) -> dict[str, Any]:
     """What the simulator and the schedulers alone make of a run: decisions, rewards and M1 as in the report."""
-    simulator, domain = options.simulator(), options.domain()
+    simulator, domain = options.simulator(), options.domain
     schedulers = [create_scheduler(policy, domain) for policy in policies]
     decisions, rewards = [], []
     while not simulator.over[0]:
@@ -40,7 +41,7 @@ def save_policy(tmp_path: Path) -> Callable[[int], str]:
         from marl_sched.agents.policies.cards import PolicyCard
         from marl_sched.agents.policies.checkpoint import save_network
 
-        graph = WorldOptions(env="airme", seed=0).simulator().graph
+        graph = get_domain("airme").simulator(get_domain("airme").instances("small", 1, 0), pad="small").graph
         with torch.random.fork_rng():
             torch.manual_seed(seed)
             network = HetGATNetwork(graph, width=4, heads=2, layers=2)

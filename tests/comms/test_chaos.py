@@ -17,7 +17,7 @@ from marl_sched.comms.chaos.cases import CASES, Case
 from marl_sched.comms.chaos.fuzz import fuzz
 from marl_sched.comms.chaos.proxy import Link
 from marl_sched.comms.chaos.stops import EXCEPTION, Stop, end_many
-from marl_sched.comms.decision_log import SCHEMA, FileLog, Header, Step, read_log
+from marl_sched.comms.decision_log import FileLog, Header, Step, read_log
 from marl_sched.comms.inproc import Threads
 from marl_sched.comms.options import WorldOptions
 from marl_sched.comms.plant import Commit
@@ -25,14 +25,19 @@ from marl_sched.comms.protocol.events import Outcome
 from marl_sched.comms.transport.endpoints import check_endpoint
 from marl_sched.comms.transport.faulty import Faults, FaultyTransport
 from marl_sched.errors import InvalidOptionError
+from marl_sched.problem import Problem
 
-LOCAL = {"view": "local", "view_options": {"reach": 1, "comm": 1, "staleness": 12}}
+LOCAL = {"kind": "local", "reach": 1, "comm": 1, "staleness": 12}
+
+
+def problem(horizon: int | None = None) -> Problem:
+    return Problem("airme", count=1, horizon=horizon, view=LOCAL)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", [case for case in CASES if case.in_short], ids=lambda case: case.name)
 def test_short_campaign_holds(tmp_path, case):
-    world = WorldOptions(env="airme", run="chaos-test", deadline=30.0, ready_timeout=200.0, standstill=200.0, **LOCAL)
+    world = WorldOptions(problem=problem(), run="chaos-test", deadline=30.0, ready_timeout=200.0, standstill=200.0)
     rows = campaign(world, "condition", tmp_path, [case])
     busy = [
         replace(row, problems=[p for p in row.problems if "held up" not in p and "s are allowed" not in p])
@@ -45,7 +50,7 @@ def test_short_campaign_holds(tmp_path, case):
 
 @pytest.mark.slow
 def test_deployments_that_are_ended_leave_nothing_but_a_report(tmp_path):
-    world = {"env": "airme", "horizon": 10**6, "run": "chaos-test", "ready_timeout": 200.0, **LOCAL}
+    world = WorldOptions(problem=problem(10**6), run="chaos-test", ready_timeout=200.0)
     stops = [Stop(1, "starting", 0.2), Stop(2, "gathering", 0.0), Stop(EXCEPTION, "running", 0.0)]
     assert end_many(stops, world, "condition", str(tmp_path)) == []
 
@@ -63,8 +68,8 @@ def test_what_nobody_would_write_changes_nothing():
 def played(tmp_path_factory):
     """A run of two days: its options, its log and its report."""
     path = tmp_path_factory.mktemp("run") / "run.jsonl"
-    world = WorldOptions(env="airme", seed=0, horizon=48, **LOCAL)
-    log = FileLog(path, Header(schema=SCHEMA, run=world.run, problem=world.problem()))
+    world = WorldOptions(problem=problem(48))
+    log = FileLog(path, Header.of(world))
     report = Threads(world, ["condition"] * 7, commits=log).play()
     log.close()
     return world, path, report
@@ -85,8 +90,8 @@ def test_audit_has_nothing_against_a_run_that_nobody_disturbed(played):
     world, path, report = played
     assert violations(world, path, path.read_bytes()[:1000], report) == []
     decided, objective = reference(world, "condition", 48)
-    assert decided == [(d["agent"], d["action"]) for d in report["decisions"]]
-    assert objective == report["M1"]
+    assert decided == [(d.agent, d.action) for d in report.decisions]
+    assert objective == report.M1
 
 
 def test_audit_sees_a_lost_commit(played, tmp_path):
@@ -184,9 +189,9 @@ def test_messages_that_are_held_back_are_overtaken_and_all_arrive():
 
 def test_faults_that_cannot_be_are_refused():
     with pytest.raises(InvalidOptionError, match=r"faults: loss: expected a probability, got 1\.5"):
-        WorldOptions(env="airme", faults={"loss": 1.5})
+        WorldOptions(problem=problem(), faults={"loss": 1.5})
     with pytest.raises(InvalidOptionError, match="faults: unknown los"):
-        WorldOptions(env="airme", faults={"los": 0.5})
+        WorldOptions(problem=problem(), faults={"los": 0.5})
 
 
 def test_link_that_is_cut_holds_everything_back_and_lets_it_go_when_it_is_mended():

@@ -10,7 +10,7 @@ import pytest
 
 from marl_sched import airme_v0
 from marl_sched.agents.registry import create_scheduler
-from marl_sched.comms.decision_log import SCHEMA, FileLog, Header, MemoryLog, Step, play_again, read_log
+from marl_sched.comms.decision_log import FileLog, Header, MemoryLog, Step, play_again, read_log
 from marl_sched.comms.fork_server import warm_up
 from marl_sched.comms.inproc import Threads, play
 from marl_sched.comms.options import WorldOptions
@@ -20,8 +20,9 @@ from marl_sched.comms.protocol import keys
 from marl_sched.comms.protocol import messages as wire
 from marl_sched.comms.replay import replay
 from marl_sched.errors import InvalidFileError, InvalidOptionError
+from marl_sched.problem import Problem
 
-LOCAL = {"view": "local", "view_options": {"reach": 1, "comm": 1, "staleness": 12}}
+LOCAL = {"kind": "local", "reach": 1, "comm": 1, "staleness": 12}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -30,10 +31,10 @@ def compiled() -> None:
     warm_up(options(), ["random", "condition"])
 
 
-def options(**changes) -> WorldOptions:
+def options(*, seed=0, horizon=60, view=LOCAL, **changes) -> WorldOptions:
     """Seven crews; nobody is ever late unless the test says so."""
-    base = {"env": "airme", "seed": 0, "horizon": 60, "deadline": 30.0, "ready_timeout": 30.0, **LOCAL}
-    return WorldOptions(**{**base, **changes})
+    problem = Problem("airme", count=1, seed=seed, horizon=horizon, view=view)
+    return WorldOptions(**{"problem": problem, "deadline": 30.0, "ready_timeout": 30.0, **changes})
 
 
 def assert_same_run(report, reference) -> None:
@@ -46,15 +47,15 @@ def assert_same_run(report, reference) -> None:
     "view",
     [
         LOCAL,
-        {"view": "full"},
-        {"view": "local", "view_options": {"reach": 0, "comm": 2}},
-        {"view": "random", "view_options": {"staleness_most": 24, "fresh_share": 0.0}},
+        {"kind": "full"},
+        {"kind": "local", "reach": 0, "comm": 2},
+        {"kind": "random", "staleness_most": 24, "fresh_share": 0.0},
     ],
 )
 @pytest.mark.parametrize("policy", ["random", "condition"])
 def test_distributed_run_equals_the_run_in_process(in_process, view, policy):
-    given = options(**{"view_options": {}, **view})
-    report = play(given, [policy] * 7)
+    given = options(view=view)
+    report = play(given, [policy] * 7).as_json()
     assert_same_run(report, in_process(given, [policy] * 7))
     assert report["missed_deadlines"] == report["unparsed"] == report["stale"] == 0
     assert report["ending"] == {"kind": "complete", "reason": None, "exit_code": 0}
@@ -65,7 +66,7 @@ def test_lost_and_repeated_messages_change_nothing(make_run, make_bus, in_proces
     bus = make_bus(lambda key, payload: int(rng.choice([0, 1, 2], p=[0.15, 0.7, 0.15])))
     given = options(horizon=12)
     run = make_run(given, ["random"] * 7, bus)
-    report = run.play()
+    report = run.play().as_json()
     assert_same_run(report, in_process(given, ["random"] * 7))
     assert sum(agent.protocol.counts["snapshots"] for agent in run.agents) > 7  # somebody had to ask again
 
@@ -102,7 +103,7 @@ def test_neither_turns_nor_frame_tell_the_key_of_the_noise(make_run, make_bus):
 def test_decision_is_applied_once_though_it_comes_thrice(make_run, make_bus, in_process):
     bus = make_bus(lambda key, payload: 3 if key.endswith("/decision") else 1)
     given = options(horizon=20)
-    report = make_run(given, ["random"] * 7, bus).play()
+    report = make_run(given, ["random"] * 7, bus).play().as_json()
     assert_same_run(report, in_process(given, ["random"] * 7))
 
 
@@ -128,7 +129,7 @@ def test_illegal_action_idles_the_agent_for_the_epoch(make_run):
         original(index)
 
     run.run_agent = run_agent
-    report = run.play()
+    report = run.play().as_json()
     mine = [d for d in report["decisions"] if d["agent"] == "crew_2"]
     assert [d["outcome"] for d in mine] == ["illegal"] * 10  # never at work, so asked every hour
     assert report["illegal"] == 10
@@ -144,7 +145,7 @@ def test_agent_that_does_not_exist_says_so(make_run):
 
 def test_report_counts_messages_latencies_and_what_agents_counted(make_run):
     run = make_run(options(horizon=30), ["condition"] * 7)
-    report = run.play()
+    report = run.play().as_json()
     assert report["messages"]["heard"]["crew/decision"]["count"] == len(report["decisions"])
     assert 0 < report["latency_ms"]["p50"] <= report["latency_ms"]["p99"]
     assert len(report["profit"]) == report["time"] == 30
@@ -158,11 +159,11 @@ def test_report_counts_messages_latencies_and_what_agents_counted(make_run):
 
 
 def plant_of(given: WorldOptions) -> SimulatedPlant:
-    return SimulatedPlant(given.domain(), given.telemetry(), given.simulator())
+    return SimulatedPlant(given.domain, given.telemetry(), given.simulator())
 
 
 def logged(path: Path, given: WorldOptions) -> FileLog:
-    return FileLog(path, Header(schema=SCHEMA, run=given.run, problem=given.problem()))
+    return FileLog(path, Header.of(given))
 
 
 def test_log_plays_again_to_the_same_rewards(tmp_path, in_process):
@@ -173,7 +174,7 @@ def test_log_plays_again_to_the_same_rewards(tmp_path, in_process):
     steps = [line for line in read_log(path) if isinstance(line, Step)]
     assert play_again(plant, steps, path) == len(reference["decisions"])
     assert [commit.reward for step in steps for commit in step.commits] == reference["rewards"]
-    assert plant.summary()["objectives"]["profit"] == reference["M1"]
+    assert plant.summary().objectives["profit"] == reference["M1"]
 
 
 @pytest.mark.parametrize("torn", [b"", b'{"type":"commit","comm'])
@@ -182,7 +183,7 @@ def test_world_goes_on_from_its_log_as_if_it_had_never_ended(tmp_path, in_proces
     Threads(given, ["random"] * 7, commits=logged(path, given)).play()
     lines = path.read_bytes().splitlines(keepends=True)
     path.write_bytes(b"".join(lines[: len(lines) // 2]) + torn)  # killed in the middle of the run
-    report = Threads(given, ["random"] * 7, commits=logged(path, given)).play()
+    report = Threads(given, ["random"] * 7, commits=logged(path, given)).play().as_json()
     assert_same_run(report, in_process(given, ["random"] * 7))
 
 
@@ -214,8 +215,8 @@ def test_file_that_is_no_log_is_refused(tmp_path, content):
 def test_replay_gives_the_report_of_the_run_and_its_picture(tmp_path):
     pytest.importorskip("matplotlib")
     given, path, picture = options(horizon=30), tmp_path / "run.jsonl", tmp_path / "run.png"
-    report = Threads(given, ["random"] * 7, commits=logged(path, given)).play()
-    again = replay(path, picture)
+    report = Threads(given, ["random"] * 7, commits=logged(path, given)).play().as_json()
+    again = replay(path, picture).as_json()
     for name in ("ending", "decisions", "rewards", "objectives", "M1", "profit", "view", "time"):
         assert again[name] == report[name], name
     assert picture.read_bytes().startswith(b"\x89PNG")
@@ -226,21 +227,19 @@ def test_replay_of_a_log_that_ends_early_says_where(tmp_path):
     Threads(given, ["random"] * 7, commits=logged(path, given)).play()
     lines = path.read_bytes().splitlines(keepends=True)
     path.write_bytes(b"".join(lines[:10]))
-    again = replay(path)
+    again = replay(path).as_json()
     assert again["ending"]["kind"] == "failed"
     assert again["ending"]["reason"] == f"the log ends at hour {again['time']}"
     assert len(again["decisions"]) == 9
 
 
 @pytest.mark.parametrize("policy", ["random", "condition"])
-@pytest.mark.parametrize("view", [LOCAL, {"view": "full", "view_options": {}}])
+@pytest.mark.parametrize("view", [LOCAL, {"kind": "full"}])
 def test_simultaneous_run_equals_the_parallel_api(view, policy):
-    given = options(conflict="priority", **view)
-    report = play(given, [policy] * 7)
-    env = airme_v0.parallel_env(
-        scale="small", split="test", horizon=60, view={"kind": given.view, **given.view_options}
-    )
-    env.reset(seed=0, options={"instance": given.load_instance()})
+    given = options(conflict="priority", view=view)
+    report = play(given, [policy] * 7).as_json()
+    env = airme_v0.parallel_env(scale="small", split="test", horizon=60, view=view)
+    env.reset(seed=0, options={"instance": given.problem.instances[0]})
     schedulers = {agent: create_scheduler(policy, "airme") for agent in env.agents}
     expected, rewards = [], []
     while env.agents:

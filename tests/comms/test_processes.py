@@ -21,17 +21,19 @@ from marl_sched.comms.launcher import Deployment, deploy
 from marl_sched.comms.options import DeployOptions, WorldOptions
 from marl_sched.comms.process import print_progress
 from marl_sched.errors import DeploymentError, UnknownNameError
+from marl_sched.problem import Problem
 
-LOCAL = {"view": "local", "view_options": {"reach": 1, "comm": 1, "staleness": 12}}
+LOCAL = {"kind": "local", "reach": 1, "comm": 1, "staleness": 12}
+AIRME = {"schema": 1, "env": "airme", "unit": "hours", "count": 1}
 needs_proc = pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="looks for processes in /proc")
 
 
-def world(**changes) -> WorldOptions:
+def world(*, horizon=48, **changes) -> WorldOptions:
     """Seven crews under a run's name of their own; nobody is late on a busy machine."""
     run = f"test-{uuid.uuid4().hex[:12]}"
     defaults = {
-        "env": "airme", "seed": 0, "horizon": 48, "run": run, "listen": "tls/127.0.0.1:0", "deadline": 30.0,
-        "ready_timeout": 200.0, "standstill": 200.0, "grace": 60.0, **LOCAL,
+        "problem": Problem("airme", count=1, horizon=horizon, view=LOCAL), "run": run, "listen": "tls/127.0.0.1:0",
+        "deadline": 30.0, "ready_timeout": 200.0, "standstill": 200.0, "grace": 60.0,
     }  # fmt: skip
     return WorldOptions(**{**defaults, **changes})
 
@@ -70,7 +72,7 @@ def test_processes_play_the_run_that_is_played_in_process(in_process, save_polic
     report = deploy(
         DeployOptions(world=given, policy=policies[0], agent_policies={"crew_6": "condition"}),
         lambda *progress: told.append(progress),
-    )
+    ).as_json()
     reference = in_process(given, policies)
     assert [agent["policy"] for agent in report["agents"]] == policies
     assert report["decisions"] == reference["decisions"]
@@ -90,7 +92,7 @@ def test_killed_agent_is_started_again_and_nothing_is_lost(in_process, tmp_path)
     options = DeployOptions(world=given, policy="condition", folder=str(tmp_path / "kept"))
     with Deployment(options) as deployment:
         kill = At((20, lambda: deployment.signal("crew_3", signal.SIGKILL)))
-        report = deployment.wait(kill)
+        report = deployment.wait(kill).as_json()
     assert kill.done
     assert report["restarts"] == {"crew_3": 1}
     mine = [e["event"] for e in report["events"] if e["agent"] == "crew_3"]
@@ -121,12 +123,12 @@ def test_a_line_of_progress_is_one_write_also_where_python_does_not_buffer(monke
 def test_agent_that_is_lost_is_said_in_report_and_exit_code():
     given = world(horizon=3000, grace=0.5)
     with Deployment(DeployOptions(world=given, policy="condition", restarts=0)) as deployment:
-        report = deployment.wait(At((20, lambda: deployment.signal("crew_3", signal.SIGKILL))))
+        report = deployment.wait(At((20, lambda: deployment.signal("crew_3", signal.SIGKILL)))).as_json()
     (death,) = report["deaths"]
     assert (death["agent"], death["event"]) == ("crew_3", "lost")
     assert report["ending"] == {"kind": "complete", "reason": None, "exit_code": 3}
     assert report["exit_codes"]["crew_3"] == -signal.SIGKILL
-    assert report["time"] == given.horizon
+    assert report["time"] == given.problem.horizon
     later = [d for d in report["decisions"] if d["hour"] > death["hour"]]
     assert {d["outcome"] for d in later if d["agent"] == "crew_3"} == {"absent"}
     assert "absent" not in {d["outcome"] for d in later if d["agent"] != "crew_3"}
@@ -138,7 +140,7 @@ def test_world_that_is_killed_goes_on_from_its_log(in_process):
     given = world(horizon=3000)
     with Deployment(DeployOptions(world=given, policy="condition")) as deployment:
         kill = At((20, lambda: deployment.signal("world", signal.SIGKILL)))
-        report = deployment.wait(kill)
+        report = deployment.wait(kill).as_json()
     reference = in_process(given, ["condition"] * 7)
     assert kill.done
     assert report["restarts"]["world"] == 1
@@ -158,7 +160,7 @@ def test_world_that_is_frozen_for_a_while_loses_nobody(in_process):
             time.sleep(3.0)
             deployment.signal("world", signal.SIGCONT)
 
-        report = deployment.wait(At((20, freeze)))
+        report = deployment.wait(At((20, freeze))).as_json()
     assert report["deaths"] == []
     assert report["slept_s"] > 1.0
     assert report["decisions"] == in_process(given, ["condition"] * 7)["decisions"]
@@ -174,7 +176,7 @@ def test_frozen_agent_is_given_up_and_comes_back_as_another_incarnation():
                 (20, lambda: deployment.signal("crew_3", signal.SIGSTOP)),
                 (200, lambda: deployment.signal("crew_3", signal.SIGCONT)),  # no repair is that long: its turn has come
             )
-        )
+        ).as_json()
     mine = [e["event"] for e in report["events"] if e["agent"] == "crew_3" and e["event"] not in ("late", "gone")]
     assert mine[0] == mine[-1] == "joined"
     assert set(mine[1:-1]) <= {"lost", "silent", "unheard", "returned"}
@@ -188,17 +190,17 @@ def test_frozen_agent_is_given_up_and_comes_back_as_another_incarnation():
 def test_launcher_that_is_ended_leaves_a_report_and_no_process_or_folder(tmp_path, number, at):
     given = world(horizon=10**6)
     code = (
-        "import json, sys\n"
+        "import sys\n"
         "from marl_sched.comms.launcher import deploy\n"
         "from marl_sched.comms.options import DeployOptions, WorldOptions\n"
+        "from marl_sched.comms.process import parse_options\n"
         "print('begun', flush=True)\n"
         "def progress(phase, tick, horizon):\n    print(phase, flush=True)\n"
-        "deploy(DeployOptions(world=WorldOptions(**json.loads(sys.argv[1])), policy='condition'), progress)\n"
+        "deploy(DeployOptions(world=parse_options(sys.argv[1], WorldOptions), policy='condition'), progress)\n"
     )
     report, temporary = tmp_path / "report.json", tmp_path / "tmp"
     temporary.mkdir()
-    names = ("env", "seed", "horizon", "run", "listen", "ready_timeout")
-    options = json.dumps({**{name: getattr(given, name) for name in names}, "report": str(report), **LOCAL})
+    options = json.dumps({**given.as_json(), "report": str(report)})
     launcher = subprocess.Popen(
         [sys.executable, "-P", "-c", code, options],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**os.environ, "TMPDIR": str(temporary)},
@@ -260,7 +262,7 @@ def test_port_in_use_is_one_line_and_exit_code_2():
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
-        done = run_module("world", {"env": "airme", "listen": endpoint})
+        done = run_module("world", {"problem": AIRME, "listen": endpoint})
     assert done.returncode == 2
     assert done.stderr == f"error: cannot listen on {endpoint}: Address already in use\n"
     assert done.stdout == ""
@@ -273,14 +275,14 @@ def test_port_in_use_is_one_line_and_exit_code_2():
         ("agent", {"agent": 0, "policy": "condition", "connect": "tcp/127.0.0.1:1", "join_timeout": 0.5}, "no world"),
         ("agent", {"agent": -1, "policy": "condition"}, "agent: expected an index >= 0, got -1"),
         ("agent", {"agent": "x", "policy": "condition"}, "Expected `int`, got `str` - at `$.agent`"),
-        ("world", {"env": "airme", "huors": 3}, "unknown huors"),
-        ("world", {"env": "airmee"}, "did you mean 'airme'"),
-        ("world", {"env": "airme", "scale": "tiny"}, "unknown scale of airme 'tiny'"),
-        ("world", {"env": "airme", "view": "locall"}, "did you mean 'local'"),
-        ("world", {"env": "airme", "view": "full", "view_options": {"reach": 1}}, "reach"),
-        ("world", {"env": "airme", "listen": "127.0.0.1:7447"}, "expected an endpoint such as tcp/127.0.0.1:7447"),
-        ("world", {"env": "airme", "deadline": 0}, "deadline: expected a number > 0"),
-        ("world", {"env": "airme", "clock": "fast"}, "Invalid enum value 'fast'"),
+        ("world", {"problem": AIRME, "huors": 3}, "unknown huors"),
+        ("world", {"problem": {**AIRME, "env": "airmee"}}, "did you mean 'airme'"),
+        ("world", {"problem": {**AIRME, "scale": "tiny"}}, "unknown scale of airme 'tiny'"),
+        ("world", {"problem": {**AIRME, "view": "locall"}}, "did you mean 'local'"),
+        ("world", {"problem": {**AIRME, "view": {"kind": "full", "reach": 1}}}, "reach"),
+        ("world", {"problem": AIRME, "listen": "127.0.0.1:7447"}, "expected an endpoint such as tcp/127.0.0.1:7447"),
+        ("world", {"problem": AIRME, "deadline": 0}, "deadline: expected a number > 0"),
+        ("world", {"problem": AIRME, "clock": "fast"}, "Invalid enum value 'fast'"),
     ],
 )
 def test_wrong_options_are_one_line_and_exit_code_2(name, options, message):
@@ -295,7 +297,8 @@ IMPORTS = """
 import sys
 import marl_sched.comms.{module}
 from marl_sched.comms.options import WorldOptions
-WorldOptions(env="airme", seed=0).simulator()
+from marl_sched.problem import Problem
+WorldOptions(problem=Problem("airme", count=1)).simulator()
 loaded = sorted(name for name in sys.modules if name.split(".")[0] in {{"torch", "tensordict"}})
 print(loaded + sorted(name for name in sys.modules if name.startswith(("marl_sched.agents", "marl_sched.train"))))
 """

@@ -113,13 +113,14 @@ def test_vectorised_environments_without_a_seed_are_not_alike(domain):
 def test_the_trainers_instances_are_neither_validated_nor_evaluated_on():
     pytest.importorskip("torchrl")
     from marl_sched.domain import get_domain
+    from marl_sched.problem import Problem
     from marl_sched.train.config import load_config
     from marl_sched.train.environment import InstanceSource
     from marl_sched.train.validation import Validation
 
     domain, seed = get_domain("airme"), 3
     config = load_config(["env=airme", "validation.instances=20", f"validation.seed={seed}", f"seed={seed}"])
-    source = InstanceSource(domain, ["small"], seed=seed, rows=20)
+    source = InstanceSource(Problem(domain, seed=seed, split="train"), ["small"], rows=20)
     trained = {source(row, 0).identity for row in range(20)}
     validated = {instance.identity for instance in Validation(config)._problems["small"].instances}
     evaluated = {instance.identity for instance in domain.instances("small", 20, seed)}

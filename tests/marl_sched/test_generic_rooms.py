@@ -2,20 +2,22 @@
 
 import ast
 import re
+from io import StringIO
 from pathlib import Path
+from token import COMMENT
+from tokenize import generate_tokens
 
 import pytest
 
 from marl_sched.envs import DOMAINS
 
 ROOT = Path(__file__).resolve().parents[2]
-GENERIC = ("marl_sched", "envs/api", "train", "comms")
+GENERIC = ("marl_sched", "envs/api", "train", "comms", "agents/policies", "agents/networks")
 # Public modules of one domain, and the files that register it.
 REGISTRATION = {"marl_sched/__init__.py", "marl_sched/gymnasium_ids.py", "marl_sched/pettingzoo_ids.py"}
 FILES = sorted(
     path
-    for room in GENERIC
-    for path in (ROOT / room).rglob("*.py")
+    for path in [*(ROOT / "agents").glob("*.py"), *(path for room in GENERIC for path in (ROOT / room).rglob("*.py"))]
     if str(path.relative_to(ROOT)) not in REGISTRATION
     and not path.name.startswith(tuple(f"{name}_v" for name in DOMAINS))
 )
@@ -23,7 +25,7 @@ NAMES = re.compile("|".join(DOMAINS), re.IGNORECASE)
 
 
 def named(source: str) -> list[str]:
-    """Words of a module's code that name a domain; docstrings and comments are none."""
+    """Words of a module's code and comments that name a domain; docstrings are none."""
     tree = ast.parse(source)
     docstrings = {
         id(node.body[0].value)
@@ -37,6 +39,7 @@ def named(source: str) -> list[str]:
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings:
             words.append(node.value)
         words += [getattr(node, field) for field in ("id", "attr", "name", "module", "arg") if hasattr(node, field)]
+    words += [token.string for token in generate_tokens(StringIO(source).readline) if token.type == COMMENT]
     return [word for word in words if isinstance(word, str) and NAMES.search(word)]
 
 
@@ -48,4 +51,5 @@ def test_no_domain_is_named_in_code_that_serves_all(path):
 def test_a_name_in_code_would_be_seen_and_one_in_a_docstring_not():
     first = next(iter(DOMAINS))
     assert named(f'"""Like {first}."""\nenv = \'{first}\'\n') == [first]
+    assert named(f"fleet = 3  # of {first}\n") == [f"# of {first}"]
     assert named(f"import marl_sched.envs.{first}.views\n") == [f"marl_sched.envs.{first}.views"]

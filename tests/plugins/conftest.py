@@ -5,6 +5,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+import gymnasium
 import pytest
 
 from marl_sched import domain
@@ -38,6 +39,8 @@ def installed(site, monkeypatch):
     monkeypatch.syspath_prepend(str(site))
     monkeypatch.setenv("PYTHONPATH", str(site))
     monkeypatch.setattr(domain, "_DOMAINS", dict(domain._DOMAINS))
+    monkeypatch.setattr(gymnasium.envs.registration, "registry", registry := dict(gymnasium.registry))
+    monkeypatch.setattr(gymnasium, "registry", registry)
     yield
     for name in set(sys.modules) - before:
         if name.partition(".")[0] == "couriers":

@@ -35,6 +35,35 @@ def test_rewards_and_their_parts_sum_to_the_total_in_aec_and_parallel(installed,
         assert sum(told.values()) == pytest.approx(next(iter(rewards.values())))
 
 
+def test_a_joint_step_pays_what_the_turns_that_it_covers_would(installed):
+    """Both play the same first test episode, everybody doing nothing: the returns and their parts are equal."""
+    import gymnasium
+    import numpy as np
+
+    from marl_sched import gymnasium_ids
+    from marl_sched.envs.api.aec import SchedulingAEC
+
+    gymnasium_ids.register()
+    options = {"scale": "town", "objective": "strain", "split": "test"}
+    central = gymnasium.make("marl_sched/Couriers-v0", **options)
+    central.reset(seed=2)
+    paid, parts, over = 0.0, {"waiting": 0.0, "travel": 0.0}, False
+    while not over:
+        _, reward, terminated, truncated, info = central.step(np.zeros_like(central.action_space.nvec))
+        paid, over = paid + reward, terminated or truncated
+        assert sum(info["reward_parts"].values()) == pytest.approx(reward)
+        parts = {name: part + info["reward_parts"][name] for name, part in parts.items()}
+    turns = SchedulingAEC("couriers", **options)
+    turns.reset(seed=2)
+    expected = 0.0
+    while turns.simulator.acting[0] >= 0:
+        turns.step(0)
+        expected += turns.rewards[turns.agents[0]]
+    assert paid == pytest.approx(expected)
+    assert paid == pytest.approx(sum(parts.values()))
+    assert parts["waiting"] < 0 == parts["travel"]
+
+
 def test_it_is_an_objective_of_the_command_line(run, tmp_path):
     command = ("evaluate", "--env", "couriers", "--schedulers", "nearest", "--instances", 2, "--episodes", 1)
     ended = run(*command, "--objective", "strain", "--json", tmp_path / "r.json")

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from marl_sched.agents.networks.hetgat.network import HetGATNetwork
+from marl_sched.problem import Problem
 from marl_sched.train.collect import Rollout, SegmentCollector
 from marl_sched.train.curriculum import EpisodeLength
 from marl_sched.train.environment import TrainingTask
@@ -23,10 +24,8 @@ def fixed(length: int) -> EpisodeLength:
 def task(
     *, rows: int = 4, length: int = 8, turns: int | None = 30, view: Mapping[str, Any] = LOCAL, **options: Any
 ) -> TrainingTask:
-    return TrainingTask(
-        domain="airme", scales=["small"], objective="profit", view=view, seed=3, rows=rows, length=fixed(length),
-        turns=turns, **options,
-    )  # fmt: skip
+    problem = Problem("airme", scale="small", objective="profit", view=view, seed=3, split="train", horizon=2 * length)
+    return TrainingTask(problem=problem, scales=["small"], rows=rows, length=fixed(length), turns=turns, **options)
 
 
 def segment(policy: HetGATNetwork, **options: Any) -> Rollout:

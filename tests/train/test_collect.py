@@ -10,6 +10,7 @@ from torchrl.envs import check_env_specs
 from marl_sched.agents.networks.hetgat.network import HetGATNetwork
 from marl_sched.domain import get_domain
 from marl_sched.errors import InvalidOptionError
+from marl_sched.problem import Problem
 from marl_sched.train.collect import EpisodeCollector, Rollout, SegmentCollector, WorkerCollector, segment_collector
 from marl_sched.train.environment import InstanceSource
 from tests.train.playing import task
@@ -19,6 +20,10 @@ from tests.train.playing import task
 def policy() -> HetGATNetwork:
     torch.manual_seed(0)
     return HetGATNetwork(task().environment(0, 1).simulator.graph, width=2, heads=2, layers=1)
+
+
+def source_of(scales: list[str], *, seed: int, rows: int) -> InstanceSource:
+    return InstanceSource(Problem("airme", seed=seed, split="train"), scales, rows=rows)
 
 
 def same(a: Rollout, b: Rollout) -> bool:
@@ -64,7 +69,7 @@ def test_a_segment_goes_on_where_the_last_one_stopped(policy: HetGATNetwork):
 def test_a_row_at_its_length_is_cut_with_a_future_and_begins_a_new_instance(policy: HetGATNetwork):
     collector = SegmentCollector(task(turns=60))
     rollout = collector.collect(policy, 8)
-    first = [InstanceSource(get_domain("airme"), ["small"], seed=3, rows=4)(row, 0).identity for row in range(4)]
+    first = [source_of(["small"], seed=3, rows=4)(row, 0).identity for row in range(4)]
     for row in range(4):
         cuts = rollout.boundary[:, row].nonzero().squeeze(1)
         assert len(cuts) > 1
@@ -146,7 +151,7 @@ def test_a_resumed_run_with_workers_plays_no_episode_twice():
     other.restore(collector.state())
     env = other._factories()[1]()
     env.reset()
-    source = InstanceSource(get_domain("airme"), ["small"], seed=3, rows=4)
+    source = source_of(["small"], seed=3, rows=4)
     assert env.simulator.instances[0].identity == source(2, 15).identity
 
 
@@ -157,14 +162,14 @@ def test_workers_share_rows_evenly():
 
 def test_instances_of_a_run_are_those_of_no_evaluation_with_the_same_seed():
     domain = get_domain("airme")
-    source = InstanceSource(domain, ["small"], seed=3, rows=8)
+    source = source_of(["small"], seed=3, rows=8)
     drawn = {source(row, count).identity for row in range(8) for count in range(3)}
     assert len(drawn) == 24
     assert not drawn & {instance.identity for instance in domain.instances("small", 30, 3)}
 
 
 def test_scales_take_turns():
-    source = InstanceSource(get_domain("airme"), ["small", "large"], seed=0, rows=4)
+    source = source_of(["small", "large"], seed=0, rows=4)
     sizes = [source(row, 0).n_planes for row in range(4)]
     assert [size > 40 for size in sizes] == [False, True, False, True]
 

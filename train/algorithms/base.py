@@ -19,8 +19,10 @@ import msgspec
 
 from marl_sched.agents.networks.hetgat.network import HetGATConfig, HetGATCritic
 from marl_sched.agents.networks.network import PolicyNetwork, slots_of
+from marl_sched.domain import get_domain
 from marl_sched.envs.api.torchrl_env import SchedulingTorchRL
 from marl_sched.errors import InvalidOptionError, UnknownNameError
+from marl_sched.problem import Problem
 from marl_sched.train.collect import Collector, SegmentCollector, segment_collector
 from marl_sched.train.curriculum import EpisodeLength
 from marl_sched.train.device import pick_device
@@ -71,16 +73,18 @@ class Setup:
 
     def _task(self, **options: Any) -> TrainingTask:
         config = self.config
-        return TrainingTask(
-            domain=config.env.name,
-            scales=config.env.scales,
+        domain = get_domain(config.env.name)
+        problem = Problem(
+            domain,
+            scale=domain.largest_scale(config.env.scales),
             objective=config.env.objective,
             view=config.view,
             options=config.env.options,
             seed=config.seed,
-            length=self.length,
-            **options,
+            split="train",
+            horizon=2 * self.length.longest,  # cuts come before the end, so that a state at a cut still has a value
         )
+        return TrainingTask(problem=problem, scales=config.env.scales, length=self.length, **options)
 
     def policy(self, env: SchedulingTorchRL) -> PolicyNetwork:
         """A freshly drawn network. Weights are drawn on the CPU, so that a seed's are the same on every device."""
@@ -122,8 +126,18 @@ def algorithms() -> Mapping[str, type[AlgorithmConfig]]:
         import_module(module.name)
     for entry in entry_points(group=GROUP):
         entry.load()
-    known = sorted(AlgorithmConfig.__subclasses__(), key=lambda config: config.algorithm_name())
+    known = sorted(_named(AlgorithmConfig), key=lambda config: config.algorithm_name())
     return {config.algorithm_name(): config for config in known}
+
+
+def _named(base: type[AlgorithmConfig]) -> list[type[AlgorithmConfig]]:
+    """The subclasses that name an algorithm by their tag; others are what several algorithms share."""
+    found: list[type[AlgorithmConfig]] = []
+    for config in base.__subclasses__():
+        if config.__struct_config__.tag is not None:
+            found.append(config)
+        found += _named(config)
+    return found
 
 
 def algorithm_config(content: Mapping[str, Any]) -> AlgorithmConfig:

@@ -22,11 +22,12 @@ from msgspec import Meta, Struct
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from marl_sched.agents.base import AdvantageScheduler, PrivilegedInfo
+from marl_sched.agents.base import AdvantageScheduler
 from marl_sched.agents.networks.network import PolicyNetwork
 from marl_sched.agents.registry import create_scheduler
 from marl_sched.errors import InvalidOptionError
 from marl_sched.graph import ACTION_MASK
+from marl_sched.privileged import PrivilegedInfo
 from marl_sched.train.algorithms.base import NAME, AlgorithmConfig, Setup
 from marl_sched.train.bounds import Count, NonNegative, Positive
 from marl_sched.train.collect import Collector, Rollout

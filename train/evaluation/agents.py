@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import numpy as np
+
+from marl_sched.train.evaluation.results import AgentFigure, AgentsSummary
 
 SHARED = "utilisation"  # the figure by which work is said to be shared
 
@@ -34,24 +35,24 @@ def joined_figures(parts: Sequence[dict[str, np.ndarray]], n_instances: int) -> 
     return {name: values.reshape(n_instances, -1, widest) for name, values in whole.items()}
 
 
-def summarise_agents(figures: dict[str, np.ndarray], names: Sequence[str] | None = None) -> dict[str, Any]:
-    """Figures, name -> float64 (I, E, A), as JSON.
+def summarise_agents(figures: Mapping[str, np.ndarray], names: Sequence[str] | None = None) -> AgentsSummary:
+    """Figures, name -> float64 (I, E, A), summarised.
 
     Of each figure the mean over all agents of all episodes, and the means over episodes of the least and the greatest
     agent; `fairness` of the utilisation. With `names`, one for each agent of the only instance, also `by_agent`.
     """
-    data: dict[str, Any] = {}
-    for name, values in figures.items():
-        data[name] = {
-            "mean": float(np.nanmean(values)),
-            "least": float(np.nanmin(values, axis=-1).mean()),
-            "greatest": float(np.nanmax(values, axis=-1).mean()),
-        }
+    found = {
+        name: AgentFigure(
+            mean=float(np.nanmean(values)),
+            least=float(np.nanmin(values, axis=-1).mean()),
+            greatest=float(np.nanmax(values, axis=-1).mean()),
+        )
+        for name, values in figures.items()
+    }
     if SHARED in figures:
-        data["fairness"] = {"mean": float(fairness(figures[SHARED]).mean())}
+        found["fairness"] = AgentFigure(mean=float(fairness(figures[SHARED]).mean()))
+    by_agent = None
     if names is not None:
         means = {name: values.mean(axis=(0, 1)) for name, values in figures.items()}
-        data["by_agent"] = {
-            agent: {name: float(mean[i]) for name, mean in means.items()} for i, agent in enumerate(names)
-        }
-    return data
+        by_agent = {agent: {name: float(mean[i]) for name, mean in means.items()} for i, agent in enumerate(names)}
+    return AgentsSummary(figures=found, by_agent=by_agent)

@@ -1,6 +1,6 @@
 """What `marl-sched compare` adds to the numbers: pictures, each drawn from something that is at hand as a file.
 
-Bars are drawn from results as JSON and learning curves from training logs as CSV; a timeline is one episode
+Bars are drawn from results and learning curves from training logs as CSV; a timeline is one episode
 played again, which counter-based randomness makes the same one.
 """
 
@@ -10,7 +10,6 @@ import csv
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -22,12 +21,13 @@ from marl_sched.problem import Problem
 from marl_sched.simulation import TurnSimulator
 from marl_sched.train.evaluation import plots
 from marl_sched.train.evaluation.evaluate import own_options
+from marl_sched.train.evaluation.results import Results
 
 SECONDS, SCORE = "seconds", "validation"  # the columns of a training log that are drawn
 
 
-def draw_scores(path: Path, *results: Mapping[str, Any]) -> Path:
-    """The bars of one or more evaluations (schema 2) as a picture; its path."""
+def draw_scores(path: Path, *results: Results) -> Path:
+    """The bars of one or more evaluations as a picture; its path."""
     return plots.save(plots.score_bars(*results), path)
 
 
@@ -64,7 +64,7 @@ def play_episode(problem: Problem, scheduler: Scheduler, index: int = 0) -> Turn
     """The simulator after episode 0 of an instance, with what its pictures are drawn from on record."""
     options = {**own_options(scheduler, problem), **problem.domain.render_options.get("rgb_array", {})}
     simulator = problem.simulator([index], **options)
-    simulator.reset(seed=problem.seed, episodes=[0])
+    simulator.reset(seed=problem.seed, episodes=problem.episode_numbers([0]))
     return play(scheduler, simulator)
 
 

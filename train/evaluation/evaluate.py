@@ -23,17 +23,17 @@ from marl_sched.agents.base import Scheduler
 from marl_sched.agents.playing import play
 from marl_sched.errors import InvalidOptionError, require
 from marl_sched.graph import VISIBLE_SHARE
+from marl_sched.privileged import PrivilegedInfo
 from marl_sched.problem import Problem, view_as_json
 from marl_sched.simulation import TurnSimulator
 from marl_sched.statistics import Summary, paired_difference, percent_gain, summarise
 from marl_sched.train.evaluation.agents import joined_figures, summarise_agents
-from marl_sched.train.evaluation.gaps import by_instance, gaps
+from marl_sched.train.evaluation.gaps import by_instance, gaps, mean_of
+from marl_sched.train.evaluation.results import Baseline, Measure, Reference, Results, SchedulerResults
 
-SCHEMA = 2  # 1 named the horizon by its unit, as `hours`
 EXACT = "exact"  # the scheduler that the others' gap is taken to where it plays
 SHARE_EVERY = 8  # turns between two readings of the visible share
-LOCAL_SHARE = 0.45  # a view that shows more of the graph than this is not called local
-_CHUNK_CELLS = 2048 * 41 * 16  # pairs of action and agent in flight: 2048 rows of a small AirME fleet, 288 of a large
+_CHUNK_CELLS = 2048 * 41 * 16  # pairs of action and agent in flight: 2048 rows of 40 actions, 288 of 145 with 32 agents
 
 Progress = Callable[[float], None]
 """Told the share of the work that is done, in [0, 1]."""
@@ -51,13 +51,13 @@ class Scores:
         seconds: wall time of all episodes, simulation included.
         per_round: the simulator's and the scheduler's `per_round()`, name -> float64 (I, E, rounds).
         agents: the simulator's `agent_figures()` at the end of each episode, name -> float64 (I, E, agents).
-        needs: what the scheduler uses beyond the acting agent's observation, "" for nothing.
+        privileged_info: what the scheduler uses beyond the acting agent's observation.
     """
 
     measures: Mapping[str, np.ndarray]
     visible_share: float
     seconds: float
-    needs: str = ""
+    privileged_info: PrivilegedInfo = PrivilegedInfo.NONE
     per_round: Mapping[str, np.ndarray] = field(default_factory=dict)
     agents: Mapping[str, np.ndarray] = field(default_factory=dict)
 
@@ -84,7 +84,8 @@ def evaluate_scheduler(
     shares = _Shares(total, progress)
     for rows in _chunks(total, max_rows or _rows_that_fit(problem)):
         simulator = problem.simulator([row // problem.episodes for row in rows], **own_options(scheduler, problem))
-        simulator.reset(seed=problem.seed, episodes=[row % problem.episodes for row in rows])
+        episodes = problem.episode_numbers(row % problem.episodes for row in rows)
+        simulator.reset(seed=problem.seed, episodes=episodes)
         shares.begin(rows.start)
         play(scheduler, simulator, shares)
         if ended is not None:
@@ -98,7 +99,7 @@ def evaluate_scheduler(
         agents=joined_figures(agents, problem.count),
         visible_share=shares.mean,
         seconds=time.perf_counter() - started,
-        needs=str(scheduler.privileged_info),
+        privileged_info=scheduler.privileged_info,
     )
 
 
@@ -161,7 +162,7 @@ def _rows_that_fit(problem: Problem) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """Schedulers side by side: what every plot and every printed table is drawn from.
+    """Schedulers side by side, with all their scores.
 
     Attributes:
         problem: what was played.
@@ -176,67 +177,44 @@ class Table:
     reference: tuple[str, Scores] | None
     baseline: tuple[str, Any, Scores]
 
-    def as_json(self) -> dict[str, Any]:
-        """The table as schema 2 of `marl-sched evaluate --json`.
-
-        `scores` of a scheduler are its M1 in every episode, a list for each instance: two runs on the same instances
-        with the same seed are paired episode by episode.
-        """
-        problem = self.problem
-        data: dict[str, Any] = {
-            "schema": SCHEMA,
-            "env": problem.domain.name,
-            "scale": problem.pad,
-            "objective": problem.objective,
-            "better": problem.domain.better,
-            "view": {
-                **view_as_json(problem.view),
-                "visible_share": self.visible_share,
-                "local": self.visible_share <= LOCAL_SHARE,
-            },
-            "instances": problem.count,
-            "episodes": problem.episodes,
-            "horizon": problem.horizon,
-            "unit": problem.unit,
-            "seed": problem.seed,
-            "options": dict(problem.options),
-            "baseline": {"scheduler": self.baseline[0], "view": view_as_json(self.baseline[1])},
-        }
+    def results(self) -> Results:
+        """What was found, as values."""
+        problem, objective = self.problem, self.problem.objective
+        held_against = None
         if self.reference is not None:
             name, scores = self.reference
-            m1 = self._summary(scores.measures[problem.objective])
-            data["reference"] = {"scheduler": name, "view": {"kind": "full"}, "M1": m1.as_json()}
-        data["schedulers"] = {name: self._row(scores) for name, scores in self.scores.items()}
-        data["by_instance"] = by_instance(problem, self.scores)
-        return data
+            held_against = Reference(scheduler=name, M1=summarise(scores.measures[objective]))
+        return Results(
+            problem=problem,
+            baseline=Baseline(scheduler=self.baseline[0], view=view_as_json(self.baseline[1])),
+            reference=held_against,
+            schedulers={name: self._row(scores) for name, scores in self.scores.items()},
+            by_instance=by_instance(problem, self.scores),
+        )
 
-    @property
-    def visible_share(self) -> float:
-        """Share of the graph that acting agents saw, mean over the schedulers."""
-        return float(np.mean([scores.visible_share for scores in self.scores.values()]))
+    def as_json(self) -> dict[str, Any]:
+        """The results as a file has them."""
+        return self.results().as_json()
 
-    def _row(self, scores: Scores) -> dict[str, Any]:
+    def _row(self, scores: Scores) -> SchedulerResults:
         objective = self.problem.objective
         m1 = scores.measures[objective]
-        row: dict[str, Any] = {"M1": self._summary(m1).as_json(), "scores": m1.tolist()}
-        if self.reference is not None:
-            gain = percent_gain(m1, self.reference[1].measures[objective])
-            row["M2"] = self._summary(-gain if self.problem.domain.better == "lower" else gain).as_json()
-        for name, values in scores.measures.items():
-            row[name] = row["M1"] if name == objective else self._summary(values).as_json()
-        for name, values in scores.per_round.items():
-            row[name] = {"mean": _mean(values), **row.get(name, {}), "per_round": _by_round(values)}
+        gap_to_exact, gap_to_bound = None, None
         if EXACT in self.scores:
-            row |= gaps(scores, self.scores[EXACT], objective)
-        difference = paired_difference(m1, self.baseline[2].measures[objective])
-        row["difference"] = {"to": self.baseline[0], **difference.as_json()}
-        row["visible_share"] = scores.visible_share
-        row["local"] = scores.visible_share <= LOCAL_SHARE
-        if scores.agents:
-            row["agents"] = summarise_agents(dict(scores.agents), self._agents)
-        row["needs"] = scores.needs
-        row["seconds"] = scores.seconds
-        return row
+            gap_to_exact, gap_to_bound = gaps(scores, self.scores[EXACT], objective)
+        return SchedulerResults(
+            M1=summarise(m1),
+            scores=m1.tolist(),
+            M2=self._gain(m1),
+            measures=_measures(scores),
+            gap_to_exact=gap_to_exact,
+            gap_to_bound=gap_to_bound,
+            difference=paired_difference(m1, self.baseline[2].measures[objective]),
+            visible_share=scores.visible_share,
+            privileged_info=scores.privileged_info,
+            agents=summarise_agents(scores.agents, self._agents) if scores.agents else None,
+            seconds=scores.seconds,
+        )
 
     @property
     def _agents(self) -> list[str] | None:
@@ -245,8 +223,28 @@ class Table:
             return None
         return self.problem.domain.agent_names(self.problem.instances[0], int(self.problem.simulator().n_agents[0]))
 
-    def _summary(self, values: np.ndarray) -> Summary:
-        return summarise(values)
+    def _gain(self, m1: np.ndarray) -> Summary | None:
+        """Gain over the reference in percent, positive for a gain."""
+        if self.reference is None:
+            return None
+        gain = percent_gain(m1, self.reference[1].measures[self.problem.objective])
+        return summarise(-gain if self.problem.domain.better == "lower" else gain)
+
+
+def _measures(scores: Scores) -> dict[str, Measure]:
+    """All that was measured of a scheduler: statistics by episode, means by round."""
+    found = {}
+    for name, values in scores.measures.items():
+        summary = summarise(values)
+        found[name] = Measure(mean=summary.mean, summary=summary)
+    for name, values in scores.per_round.items():
+        whole = found.get(name)
+        found[name] = Measure(
+            mean=mean_of(values) if whole is None else whole.mean,
+            summary=None if whole is None else whole.summary,
+            per_round=[mean_of(values[..., k]) for k in range(values.shape[-1])],
+        )
+    return found
 
 
 def evaluate(
@@ -301,13 +299,3 @@ def _baseline(
         return reference[0], None, reference[1]
     name = next(iter(scores)) if name is None else name
     return name, view, scores[name]
-
-
-def _mean(values: np.ndarray) -> float | None:
-    """The mean of what was measured, None if nothing was; JSON knows no NaN."""
-    measured = values[~np.isnan(values)]
-    return float(measured.mean()) if measured.size else None
-
-
-def _by_round(values: np.ndarray) -> list[float | None]:
-    return [_mean(values[..., k]) for k in range(values.shape[-1])]

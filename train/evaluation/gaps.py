@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from marl_sched.problem import Problem
+from marl_sched.train.evaluation.results import Gap, InstanceRow, InstanceScores
 
 if TYPE_CHECKING:
     from marl_sched.train.evaluation.evaluate import Scores
@@ -15,17 +16,15 @@ if TYPE_CHECKING:
 SOLVER_MEASURES = ("bound", "optimal", "timed_out", "without_plan", "solver_seconds")
 
 
-def gaps(scores: Scores, exact: Scores, objective: str) -> dict[str, Any]:
-    """`gap_to_exact` and, where the exact scheduler proved bounds, `gap_to_bound`, in percent.
+def gaps(scores: Scores, exact: Scores, objective: str) -> tuple[Gap, Gap | None]:
+    """The gap to the exact scheduler and, where that proved bounds, to the bounds.
 
     Rounds count that are feasible for both, and for the bound those that are feasible; `rounds` says how many. Without
     measures by round, whole episodes are compared.
     """
     ours, theirs = _by_round(scores, objective), _by_round(exact, objective)
-    found = {"gap_to_exact": _gap(ours, theirs)}
-    if "bound" in exact.per_round:
-        found["gap_to_bound"] = _gap(ours, exact.per_round["bound"])
-    return found
+    to_bound = _gap(ours, exact.per_round["bound"]) if "bound" in exact.per_round else None
+    return _gap(ours, theirs), to_bound
 
 
 def _by_round(scores: Scores, objective: str) -> np.ndarray:
@@ -36,50 +35,51 @@ def _by_round(scores: Scores, objective: str) -> np.ndarray:
     return np.where(feasible == 1.0, scores.per_round[objective], np.nan)
 
 
-def _gap(ours: np.ndarray, base: np.ndarray) -> dict[str, float | int | None]:
+def _gap(ours: np.ndarray, base: np.ndarray) -> Gap:
     with np.errstate(divide="ignore", invalid="ignore"):
         percent = np.where(base != 0, 100.0 * (ours - base) / np.abs(base), np.where(ours == base, 0.0, np.nan))
     both = percent[~np.isnan(percent)]
     if both.size == 0:
-        return {"mean": None, "std": None, "rounds": 0}
-    return {"mean": float(both.mean()), "std": float(both.std()), "rounds": int(both.size)}
+        return Gap(mean=None, std=None, rounds=0)
+    return Gap(mean=float(both.mean()), std=float(both.std()), rounds=int(both.size))
 
 
-def by_instance(problem: Problem, scores: Mapping[str, Scores]) -> list[dict[str, Any]]:
-    """A row per instance: its file, and per scheduler the mean objective and the share of feasible rounds.
-
-    Of a solver also status, bound, gap to the bound in percent, runs that a limit ended, and seconds per round. The
-    status is that of all rounds: "optimal" if all were proved, "no plan" if one had no feasible plan, else "feasible".
-    """
+def by_instance(problem: Problem, scores: Mapping[str, Scores]) -> list[InstanceRow]:
+    """A row per instance: its file, and what every scheduler reached on it."""
     files = problem.files or (None,) * problem.count
     return [
-        {
-            "instance": i,
-            "file": None if files[i] is None else str(files[i]),
-            "schedulers": {name: _instance_row(one, i, problem.objective) for name, one in scores.items()},
-        }
+        InstanceRow(
+            instance=i,
+            file=None if files[i] is None else str(files[i]),
+            schedulers={name: _instance_scores(one, i, problem.objective) for name, one in scores.items()},
+        )
         for i in range(problem.count)
     ]
 
 
-def _instance_row(scores: Scores, i: int, objective: str) -> dict[str, Any]:
-    row: dict[str, Any] = {"objective": float(scores.measures[objective][i].mean())}
+def _instance_scores(scores: Scores, i: int, objective: str) -> InstanceScores:
+    mean = float(scores.measures[objective][i].mean())
     rounds = {name: values[i] for name, values in scores.per_round.items()}
-    if "feasible" in rounds:
-        row["feasible"] = _mean(rounds["feasible"])
-    if "bound" in rounds:
-        solved = {name: rounds[name][~np.isnan(rounds["optimal"])] for name in SOLVER_MEASURES}
-        row["status"] = (
-            "no plan" if solved["without_plan"].any() else "optimal" if (solved["optimal"] > 0).all() else "feasible"
-        )
-        row["bound"] = _mean(rounds["bound"])
-        row["gap_to_bound"] = _gap(_by_round(scores, objective)[i], rounds["bound"])["mean"]
-        row["timed_out"] = int(solved["timed_out"].sum())
-        row["seconds"] = _mean(rounds["solver_seconds"])
-    return row
+    feasible = mean_of(rounds["feasible"]) if "feasible" in rounds else None
+    if "bound" not in rounds:
+        return InstanceScores(objective=mean, feasible=feasible)
+    solved = {name: rounds[name][~np.isnan(rounds["optimal"])] for name in SOLVER_MEASURES}
+    return InstanceScores(
+        objective=mean,
+        feasible=feasible,
+        status="no plan"
+        if solved["without_plan"].any()
+        else "optimal"
+        if (solved["optimal"] > 0).all()
+        else "feasible",
+        bound=mean_of(rounds["bound"]),
+        gap_to_bound=_gap(_by_round(scores, objective)[i], rounds["bound"]).mean,
+        timed_out=int(solved["timed_out"].sum()),
+        seconds=mean_of(rounds["solver_seconds"]),
+    )
 
 
-def _mean(values: np.ndarray) -> float | None:
-    """The mean of what was measured, None if nothing was."""
+def mean_of(values: np.ndarray) -> float | None:
+    """The mean of what was measured, None if nothing was; JSON knows no NaN."""
     measured = values[~np.isnan(values)]
     return float(measured.mean()) if measured.size else None

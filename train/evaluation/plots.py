@@ -1,4 +1,4 @@
-"""Pictures of results, drawn from JSON and logs with matplotlib; every function returns a Figure and writes nothing.
+"""Pictures of results and logs, drawn with matplotlib; every function returns a Figure and writes nothing.
 
 Figures are made without pyplot: there is no global state and no display is asked for.
 """
@@ -17,6 +17,8 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from marl_sched.files import replacing
+from marl_sched.problem import Problem
+from marl_sched.train.evaluation.results import Results
 
 _INK, _FAINT = "#22303c", "#c9d1d8"
 _BARS = ("#8fb8d8", "#f0b96b", "#a7cfa4", "#c6b3dc")
@@ -30,19 +32,21 @@ def save(figure: Figure, path: Path) -> Path:
     return path
 
 
-def score_bars(*tables: Mapping[str, Any]) -> Figure:
-    """M1 of the schedulers of one or more evaluations (schema 2): interquartile mean with its interval, and mean.
+def score_bars(*tables: Results) -> Figure:
+    """M1 of the schedulers of one or more evaluations: interquartile mean with its interval, and mean.
 
     Tables differ in colour and are told apart by their views.
     """
-    rows = [(name, row["M1"], i) for i, table in enumerate(tables) for name, row in table["schedulers"].items()]
-    rows.sort(key=lambda row: row[1]["mean"], reverse=tables[0]["better"] == "lower")
+    rows = [(name, row.M1, i) for i, table in enumerate(tables) for name, row in table.schedulers.items()]
+    problem = tables[0].problem
+    rows.sort(key=lambda row: row[1].mean, reverse=problem.domain.better == "lower")
     scores = [score for _, score, _ in rows]
-    iqm = np.array([score["iqm"] for score in scores])
-    kind = "such" if all(score["ci95_such_instances"] for score in scores) else "these"
-    drawn = [score[f"ci95_{kind}_instances"] or [score["iqm"]] * 2 for score in scores]
+    iqm = np.array([score.iqm for score in scores])
+    kind = "such" if all(score.ci95_such_instances for score in scores) else "these"
+    intervals = [score.ci95_such_instances if kind == "such" else score.ci95_these_instances for score in scores]
+    drawn = [interval or (score.iqm,) * 2 for interval, score in zip(intervals, scores, strict=True)]
     low, high = np.array(drawn).T
-    means = np.array([score["mean"] for score in scores])
+    means = np.array([score.mean for score in scores])
     figure = Figure(figsize=(8.5, 1.7 + 0.4 * len(rows)), layout="constrained")
     axes = figure.add_subplot()
     y = np.arange(len(rows))
@@ -56,8 +60,8 @@ def score_bars(*tables: Mapping[str, Any]) -> Figure:
         )
     axes.set_yticks(y, [name for name, _, _ in rows])
     axes.set_xlim(min(0.0, 1.05 * low.min()), 1.12 * right or 1.0)
-    axes.set_xlabel(f"M1: mean {tables[0]['objective']} over {tables[0]['horizon']} {tables[0]['unit']}")
-    axes.set_title(_conditions(tables[0]), fontsize=10, loc="left")
+    axes.set_xlabel(f"M1: mean {problem.objective} over {problem.length}")
+    axes.set_title(_conditions(problem), fontsize=10, loc="left")
     _plain(axes)
     axes.grid(axis="x", color=_FAINT, lw=0.6)
     axes.tick_params(axis="y", length=0)
@@ -166,14 +170,13 @@ def curves_by_group(curves: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def _conditions(results: Mapping[str, Any]) -> str:
-    scale = results["scale"] or "given"
-    return f"{results['env']}, {results['instances']} {scale} instances x {results['episodes']} episodes"
+def _conditions(problem: Problem) -> str:
+    instances = f"{problem.count} {problem.pad or 'given'} instances"
+    return f"{problem.domain.name}, {instances} x {problem.episodes} episodes"
 
 
-def _view(results: Mapping[str, Any]) -> str:
-    view = results["view"]
-    return f"{view['kind']} view, {100 * view['visible_share']:.0f} % seen"
+def _view(results: Results) -> str:
+    return f"{results.problem.view.kind} view, {100 * results.visible_share:.0f} % seen"
 
 
 def _plain(axes: Axes) -> None:

@@ -24,6 +24,7 @@ from marl_sched.agents.registry import create_scheduler
 from marl_sched.domain import get_domain
 from marl_sched.errors import InvalidFileError, InvalidOptionError
 from marl_sched.kernels import sources_digest
+from marl_sched.privileged import PrivilegedInfo
 from marl_sched.problem import Problem
 from marl_sched.train.evaluation.evaluate import evaluate_scheduler
 
@@ -51,6 +52,20 @@ class Play(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_fi
     horizon: int
     schema: int = SCHEMA
 
+    def problem(self) -> Problem:
+        """What is played; its defaults are none, so that a cell keeps its name when they change."""
+        return Problem(
+            self.env,
+            scale=self.scale,
+            count=self.instances,
+            episodes=self.episodes,
+            seed=self.seed,
+            view=self.view,
+            objective=self.objective,
+            horizon=self.horizon,
+            options=self.options,
+        )
+
 
 class Bound(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind", tag="bound"):
     """Inputs of a cell that is proved: what no scheduler's expected M1 passes on each instance."""
@@ -64,6 +79,17 @@ class Bound(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_f
     price_vectors: int
     evaluations: int
     schema: int = SCHEMA
+
+    def problem(self) -> Problem:
+        """What is bounded."""
+        return Problem(
+            self.env,
+            scale=self.scale,
+            count=self.instances,
+            seed=self.seed,
+            objective=self.objective,
+            horizon=self.horizon,
+        )
 
 
 Inputs = Play | Bound
@@ -86,7 +112,7 @@ class Cell(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         M1: each instance's mean over its episodes, or its bound.
         episode_std: root of the mean over instances of the variance between an instance's episodes.
         visible_share: share of the graph that acting agents saw.
-        needs: what the scheduler uses beyond what its agents see, "" for nothing.
+        privileged_info: what the scheduler uses beyond what its agents see, by the names of PrivilegedInfo.
         training: of a learned scheduler.
         seconds: that it took.
         revision: of the source that made it.
@@ -97,11 +123,16 @@ class Cell(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     M1: list[float]
     episode_std: float | None = None
     visible_share: float | None = None
-    needs: str = ""
+    privileged_info: list[str] = []
     training: Training | None = None
     seconds: float
     revision: str
     kernels: str | None = None
+
+    @property
+    def knows(self) -> PrivilegedInfo:
+        """`privileged_info` as the flag."""
+        return PrivilegedInfo.of(self.privileged_info)
 
 
 @dataclass(frozen=True)
@@ -161,23 +192,12 @@ def _play(inputs: Play, weights: Path | None, besides: Sequence[Play]) -> list[C
             raise InvalidFileError(weights, "", "the weights that were there when the cells were listed")
         card = read_card(weights.with_suffix(".json"))
         training = Training(command=card.command, seed=card.seed, view=card.view, knowledge=card.training_knowledge)
-    problem = Problem(
-        domain,
-        scale=inputs.scale,
-        count=inputs.instances,
-        episodes=inputs.episodes,
-        seed=inputs.seed,
-        view=inputs.view,
-        objective=inputs.objective,
-        horizon=inputs.horizon,
-        options=inputs.options,
-    )
     scheduler = (
         create_scheduler(inputs.scheduler, domain)
         if weights is None
         else create_scheduler(weights, domain, mode=inputs.mode)
     )
-    scores = evaluate_scheduler(problem, scheduler)
+    scores = evaluate_scheduler(inputs.problem(), scheduler)
     revision = source_revision()
     return [
         Cell(
@@ -185,7 +205,7 @@ def _play(inputs: Play, weights: Path | None, besides: Sequence[Play]) -> list[C
             M1=_rounded(m1.mean(axis=1)),
             episode_std=round(float(np.sqrt(m1.var(axis=1).mean())), DECIMALS),
             visible_share=round(scores.visible_share, DECIMALS),
-            needs=scores.needs,
+            privileged_info=scores.privileged_info.names,
             training=training,
             seconds=round(scores.seconds, 1),
             revision=revision,
@@ -202,13 +222,13 @@ def _prove(inputs: Bound) -> Cell:
     if domain.bound is None:
         raise InvalidOptionError(f"env: no bound is known for the environment {inputs.env!r}")
     bounds = import_module(domain.bound)
-    problems = domain.instances(inputs.scale, inputs.instances, inputs.seed)
-    relaxation = bounds.Relaxation(problems, objective=inputs.objective, horizon=inputs.horizon)
+    problem = inputs.problem()
+    relaxation = bounds.Relaxation(problem.instances, objective=problem.objective, horizon=problem.horizon)
     found = bounds.upper_bounds(relaxation, price_vectors=inputs.price_vectors, evaluations=inputs.evaluations)
     return Cell(
         inputs=inputs,
         M1=_rounded(found.value, up=True),
-        needs="failure model and clock",
+        privileged_info=domain.bound_info.names,
         seconds=round(time.perf_counter() - started, 1),
         revision=source_revision(),
         kernels=sources_digest(),

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from marl_sched.files import replacing, write_json
-from marl_sched.train.evaluation.evaluate import LOCAL_SHARE
+from marl_sched.privileged import PrivilegedInfo
 from marl_sched.train.evaluation.plots import save
+from marl_sched.train.evaluation.results import LOCAL_SHARE
 from marl_sched.train.published.entries import Entries
 from marl_sched.train.published.picture import price_of_decentralisation
 from marl_sched.train.published.remarks import reading_aid
@@ -41,7 +42,7 @@ def _head(results: Mapping[str, Any]) -> Iterator[str]:
     yield f"# {results['env']}: the published tables, made again"
     if results["quick"]:
         yield "**Quick look:** few instances and episodes, a loose bound. Figures to keep are made without `--quick`."
-    bound = results["bound"]
+    bound, hidden = results["bound"], PrivilegedInfo.of(results["hidden_info"])
     fewer = "; rows that say that they played fewer episodes are held against means over all, with wider intervals"
     yield (
         f"Made by `{results['command']}`: {results['instances']} instances of each scale x {results['episodes']} "
@@ -53,18 +54,22 @@ def _head(results: Mapping[str, Any]) -> Iterator[str]:
         f"**M1** is {results['measure']}, **M2** the gain "
         f"in percent over {results['reference']} on the same instance; ± is the standard deviation over instances of "
         f"their means. *In italics*, below: what the dissertation published ({results['source']}), on other "
-        "instances of the same distribution. **Difference** is paired, to the best rule on that scale that does not "
-        "know the failure model"
-        f"{fewer if _some_fewer(results) else ''}. "
+        f"instances of the same distribution. **Difference** is paired, to the best rule on that scale"
+        f"{f' that does not know the {hidden}' if hidden else ''}{fewer if _some_fewer(results) else ''}. "
         "**IQM** is the interquartile mean of the instances. Intervals hold 95 percent for such instances: other ones "
         "drawn from the same distribution. **Way** is how much of the "
         f"distance from {results['reference']} to the upper bound a scheduler goes. The bound is proved for every "
         f"instance by `marl-sched bound` ({bound['price_vectors']} price vectors, {bound['evaluations']} evaluations): "
-        "no scheduler expects more, even if it knows the failure model and the clock; a mean over few episodes can "
+        f"no scheduler expects more{_even(PrivilegedInfo.of(results['bound_info']))}; a mean over few episodes can "
         "pass it by chance."
     )
     if results["note"]:
         yield results["note"]
+
+
+def _even(known: PrivilegedInfo) -> str:
+    """What the bound allows to be known, in words."""
+    return f", even if it knows {' and '.join(f'the {part}' for part in known)}" if known else ""
 
 
 def _published_layout(table: Mapping[str, Any]) -> str:
@@ -112,7 +117,7 @@ def _against_limits(table: Mapping[str, Any], episodes: int) -> str:
             [
                 _name(row) + _played_by(row, played) + _fewer(row, episodes),
                 _sees(row, played),
-                played[0]["needs"] or "nothing",
+                str(PrivilegedInfo.of(played[0]["privileged_info"])) or "nothing",
                 *(_against(entry) for entry in entries),
                 " / ".join(f"{entry['gap_closed']:.1f}" if "gap_closed" in entry else _NONE for entry in entries),
             ]
@@ -162,15 +167,15 @@ def _sees(row: Mapping[str, Any], played: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _decentralisation(results: Mapping[str, Any]) -> Iterator[str]:
-    section = results["decentralisation"]
+    section, agent = results["decentralisation"], results["agent"]
+    hidden = PrivilegedInfo.of(results["hidden_info"])
     yield "## The price of deciding alone"
-    yield f"![M1 against the share of the graph that a crew sees]({PICTURE})"
+    yield f"![M1 against the share of the graph that a {agent} sees]({PICTURE})"
     yield (
         f"M1 ({section['objective']}, {section['episodes']} episodes of each instance) of the same schedulers under "
-        "views that show less and less. A view is (how far a "
-        "crew sees, how far it hears, how old its snapshot of others' sectors is). Below each score is what the view "
-        "costs that scheduler: the paired difference to itself, or to its sibling, under the full view, with its 95 "
-        "percent interval."
+        f"views that show less and less. A view is (how far a {agent} sees, how far it hears, how old its snapshot of "
+        "others' sectors is). Below each score is what the view costs that scheduler: the paired difference to itself, "
+        "or to its sibling, under the full view, with its 95 percent interval."
     )
     for scale, found in section["scales"].items():
         lines = found["lines"]
@@ -183,7 +188,8 @@ def _decentralisation(results: Mapping[str, Any]) -> Iterator[str]:
         yield f"### On {scale} instances"
         yield _markdown(["view", "sees", *(line["label"] for line in lines)], rows)
         yield (
-            f"Upper bound {found['bound']:.4f}; the best that sees everything and does not know the failure model: "
+            f"Upper bound {found['bound']:.4f}; the best that sees everything"
+            f"{f' and does not know the {hidden}' if hidden else ''}: "
             f"{found['central']['label']}, {found['central']['M1']:.4f}."
         )
 

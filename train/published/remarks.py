@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from marl_sched.train.published.results import FAILURE_MODEL
+from marl_sched.privileged import PrivilegedInfo
 
 
 def reading_aid(table: Mapping[str, Any]) -> str:
@@ -14,17 +14,18 @@ def reading_aid(table: Mapping[str, Any]) -> str:
 
 
 def _best(table: Mapping[str, Any]) -> str:
-    """Who has the best mean on each scale without the failure model."""
+    """Who has the best mean on each scale without what is hidden in the field."""
+    hidden = PrivilegedInfo.of(table["hidden_info"])
     best, word = (min, "Lowest") if table["better"] == "lower" else (max, "Highest")
     told = []
     for scale in table["scales"]:
         entries = [(row, row["scales"][scale]) for row in table["rows"] if "M1" in row["scales"].get(scale, {})]
-        blind = [pair for pair in entries if FAILURE_MODEL not in pair[1]["needs"]]
+        blind = [pair for pair in entries if not PrivilegedInfo.of(pair[1]["privileged_info"]) & hidden]
         row, entry = best(blind, key=lambda pair: float(pair[1]["M1"]["mean"]))
         told.append(
             f"{row['label']} on {scale} ({entry['M1']['mean']:.4f}, {entry['gap_closed']:.1f} % of the gap closed)"
         )
-    return f"{word} mean without the failure model: {_listed(told)}."
+    return f"{word} mean{f' without the {hidden}' if hidden else ''}: {_listed(told)}."
 
 
 def _learned(table: Mapping[str, Any]) -> str:

@@ -2,7 +2,8 @@
 
 All statistics are over instances, whose scores are means over episodes. M2 is the gain over the domain's reference
 scheduler on the same instance. Differences are paired, to the best rule of the same table and scale that does not
-know the failure model. The gap closed is the share of the distance from the reference to the bound, in percent.
+know what is hidden in the field (`Domain.hidden_info`). The gap closed is the share of the distance from the
+reference to the bound, in percent.
 """
 
 from __future__ import annotations
@@ -15,14 +16,14 @@ import msgspec
 import numpy as np
 
 from marl_sched.errors import MarlSchedError
+from marl_sched.privileged import PrivilegedInfo
 from marl_sched.statistics import CONFIDENCE, holm, paired_difference, percent_gain, summarise
 from marl_sched.train.published.cells import Cell, Job, describe, digest
 from marl_sched.train.published.entries import Entries, Untrained
 from marl_sched.train.published.plan import Line, Row
 from marl_sched.train.published.store import Cells
 
-SCHEMA = 3  # 1 named the horizon by its unit, 2 had no revisions
-FAILURE_MODEL = "failure model"  # in a scheduler's `needs`
+SCHEMA = 4  # 1 named the horizon by its unit, 2 had no revisions, 3 told what schedulers know in words
 
 
 class Results:
@@ -53,6 +54,9 @@ class Results:
             "source": plan.source,
             "note": plan.note.strip(),
             "reference": self._reference_row().label,
+            "agent": plan.domain.agent_prefix,
+            "hidden_info": plan.domain.hidden_info.names,
+            "bound_info": plan.domain.bound_info.names,
             "objectives": tables,
             "decentralisation": self._decentralisation(),
             "revisions": self._cells.revisions(),
@@ -66,6 +70,7 @@ class Results:
         rows = [self._row(row, objective, scales) for row in self._plan.rows if self._stands_in(row, objective)]
         return {
             "better": self._plan.domain.better,
+            "hidden_info": self._hidden.names,
             "scales": {
                 scale: {"bound": found["bound"], "best_rule": found["best_rule"]} for scale, found in scales.items()
             },
@@ -109,7 +114,7 @@ class Results:
             if isinstance(cell := self._cell(self._entries.row(row, objective, scale)), Cell)
         }
         rules = {
-            label: cell for label, cell in played.items() if cell.training is None and FAILURE_MODEL not in cell.needs
+            label: cell for label, cell in played.items() if cell.training is None and not cell.knows & self._hidden
         }
         best = self._best({label: float(np.mean(cell.M1)) for label, cell in rules.items()})
         bound = self._made(self._entries.bound(objective, scale))
@@ -156,7 +161,7 @@ class Results:
             "difference": paired_difference(scores, against["best"]).as_json(),
             "gap_closed": 100.0 * (float(scores.mean()) - base) / (bound - base),
             "visible_share": cell.visible_share,
-            "needs": cell.needs,
+            "privileged_info": cell.privileged_info,
             "training": None if cell.training is None else msgspec.to_builtins(cell.training),
             "seconds": cell.seconds,
             "cell": digest(cell.inputs),
@@ -174,7 +179,7 @@ class Results:
             central = {
                 label: float(figures["M1"]["mean"])
                 for label, figures in seeing_all
-                if "M1" in figures and FAILURE_MODEL not in figures["needs"]
+                if "M1" in figures and not PrivilegedInfo.of(figures["privileged_info"]) & self._hidden
             }
             best = self._best(central)
             scales[scale] = {
@@ -201,8 +206,8 @@ class Results:
             if full is not None:
                 points[name]["cost"] = paired_difference(_scores(cell), _scores(full)).as_json()
         untrained = {name: entry.policy for name, entry in entries.items() if isinstance(entry, Untrained)}
-        needs = next((f" ({cell.needs})" for cell in cells.values() if cell.needs), "")
-        return {"label": line.label + needs, "points": points, "untrained": untrained}
+        knows = next((f" ({cell.knows})" for cell in cells.values() if cell.knows), "")
+        return {"label": line.label + knows, "points": points, "untrained": untrained}
 
     def _cell(self, entry: Job | Untrained | None) -> Cell | None:
         """The cell of an entry, None where there cannot be one; MarlSchedError where it is missing."""
@@ -216,6 +221,10 @@ class Results:
                 f"make what is missing with `{self._command}`"
             )
         return cell
+
+    @property
+    def _hidden(self) -> PrivilegedInfo:
+        return self._plan.domain.hidden_info
 
     @property
     def _lower(self) -> bool:

@@ -28,10 +28,11 @@ from marl_sched.agents.airme.bound.plane import (
 )
 from marl_sched.agents.airme.epochs import EpochPlayer
 from marl_sched.agents.airme.ranking import INDEX, N_FEATURES, IndexTables, Ranking, rank_observation, ranking
-from marl_sched.agents.base import AdvantageScheduler, PrivilegedInfo
+from marl_sched.agents.base import AdvantageScheduler
 from marl_sched.envs.airme.aircraft import PUBLISHED_TYPES, AircraftType, FailureModel
 from marl_sched.envs.airme.simulator import DEFAULT_HORIZON, AirmeSimulator
 from marl_sched.errors import InvalidOptionError
+from marl_sched.privileged import PrivilegedInfo
 from marl_sched.simulation import TurnSimulator
 
 INCOMES = 5  # nodes between which indices are interpolated

@@ -13,11 +13,12 @@ from marl_sched.agents.airme.bound.index import IndexScheduler
 from marl_sched.agents.airme.bound.plane import immortal_values, plane_model, reward_of, solve
 from marl_sched.agents.airme.bound.relaxation import Relaxation, price_segments, upper_bounds
 from marl_sched.agents.airme.schedulers import RULES
-from marl_sched.agents.base import PrivilegedInfo, Scheduler
+from marl_sched.agents.base import Scheduler
 from marl_sched.envs.airme.aircraft import FIXED_WING, HELICOPTER, AircraftType
 from marl_sched.envs.airme.instance import AirmeInstance, generate
 from marl_sched.envs.airme.simulator import AirmeSimulator
 from marl_sched.errors import InvalidOptionError, UnknownNameError
+from marl_sched.privileged import PrivilegedInfo
 
 HOURS = 20
 # Fails with probability 1/1.5 exp(-l/1.5) at l landings: 0.342 at one, 0.176 at two; hours do not matter.

@@ -18,11 +18,12 @@ from marl_sched.agents.airme.rules import (
     preventive_first,
 )
 from marl_sched.agents.airme.schedulers import RULES
-from marl_sched.agents.base import ObservationScheduler, PrivilegedInfo
+from marl_sched.agents.base import ObservationScheduler
 from marl_sched.envs.airme.aircraft import PUBLISHED_TYPES, AircraftType, FailureModel
 from marl_sched.envs.airme.instance import AirmeInstance, generate
 from marl_sched.envs.airme.simulator import AirmeSimulator
 from marl_sched.errors import InvalidOptionError
+from marl_sched.privileged import PrivilegedInfo
 
 FIXED, HELI = 0, 1
 

@@ -47,6 +47,10 @@ class CouriersInstance:
     jobs: tuple[Job, ...]
     couriers: tuple[Courier, ...]
 
+    def __repr__(self) -> str:
+        """One line: sizes and identity."""
+        return f"CouriersInstance({len(self.jobs)} jobs, {len(self.couriers)} couriers, {self.identity:016x})"
+
     @cached_property
     def identity(self) -> int:
         """A 64-bit hash of the content."""

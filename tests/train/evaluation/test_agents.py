@@ -8,6 +8,7 @@ from marl_sched.agents.registry import create_scheduler
 from marl_sched.domain import get_domain
 from marl_sched.envs.airme.instance import AirmeInstance
 from marl_sched.train.evaluation.agents import fairness, joined_figures, summarise_agents
+from marl_sched.train.evaluation.results import AgentFigure
 
 
 @pytest.mark.parametrize(
@@ -23,8 +24,8 @@ def test_figures_of_batches_with_other_padding_are_joined():
     whole = joined_figures(parts, 2)
     assert whole["x"].shape == (2, 1, 3)
     summary = summarise_agents({"utilisation": whole["x"]})
-    assert summary["utilisation"] == {"mean": 7 / 3, "least": 2.5, "greatest": 3.0}
-    assert "by_agent" not in summary
+    assert summary.figures["utilisation"] == AgentFigure(mean=7 / 3, least=2.5, greatest=3.0)
+    assert summary.by_agent is None
 
 
 def test_crews_figures_are_those_of_their_books():

@@ -6,31 +6,33 @@ import pytest
 from marl_sched.agents.airme.schedulers import RULES
 from marl_sched.domain import get_domain
 from marl_sched.errors import InvalidFileError
+from marl_sched.privileged import PrivilegedInfo
 from marl_sched.problem import Problem
+from marl_sched.statistics import PairedDifference, Summary
 from marl_sched.train.evaluation import plots
 from marl_sched.train.evaluation.compare import draw_learning_curves, play_episode, read_learning_curve
 from marl_sched.train.evaluation.evaluate import evaluate_scheduler
+from marl_sched.train.evaluation.results import Baseline, Results, SchedulerResults
 
 AIRME = get_domain("airme")
 
 
 def row(mean, low, high):
-    return {"M1": {"mean": mean, "std": 0.0, "iqm": mean, "ci95_such_instances": [low, high]}}
+    such = Summary(mean=mean, std=0.0, iqm=mean, ci95_these_instances=None, ci95_such_instances=(low, high))
+    difference = PairedDifference(mean=0.0, std=0.0, ci95_these_instances=None, ci95_such_instances=None, p=None)
+    known = PrivilegedInfo.NONE
+    return lambda share: SchedulerResults(
+        M1=such, scores=[], measures={}, difference=difference, visible_share=share, privileged_info=known, seconds=1.0
+    )
 
 
 def table(share, **rows):
-    return {
-        "env": "airme",
-        "scale": "small",
-        "objective": "profit",
-        "better": "higher",
-        "view": {"kind": "local", "visible_share": share},
-        "instances": 2,
-        "episodes": 3,
-        "horizon": 720,
-        "unit": "hours",
-        "schedulers": rows,
-    }
+    return Results(
+        problem=Problem(AIRME, count=2, episodes=3, view="local"),
+        baseline=Baseline(scheduler=next(iter(rows)), view={"kind": "local"}),
+        schedulers={name: make(share) for name, make in rows.items()},
+        by_instance=[],
+    )
 
 
 def test_bars_stand_in_the_order_of_their_means_best_on_top():

@@ -153,8 +153,8 @@ def test_the_table_has_the_keys_that_other_tools_read():
         assert np.mean(row["scores"]) == pytest.approx(row["M1"]["mean"], abs=1e-12)
         assert row["M1"] == row["profit"]
         assert row["seconds"] > 0
-    assert table["schedulers"]["mine"]["needs"] == "failure model"
-    assert table["schedulers"]["corrective"]["needs"] == ""
+    assert table["schedulers"]["mine"]["privileged_info"] == ["failure_model"]
+    assert table["schedulers"]["corrective"]["privileged_info"] == []
 
 
 def test_m1_is_the_objective_that_was_asked_for():

@@ -7,6 +7,7 @@ import numpy as np
 from marl_sched.problem import Problem
 from marl_sched.train.evaluation.evaluate import Scores
 from marl_sched.train.evaluation.gaps import by_instance, gaps
+from marl_sched.train.evaluation.results import Gap, InstanceScores
 
 
 def scores(makespan: list[float], feasible: list[float], **rounds: list[float]) -> Scores:
@@ -30,20 +31,20 @@ EXACT = scores(
 
 def test_rounds_that_one_of_the_two_could_not_do_have_no_gap():
     # the rule's second round was infeasible and charged 500; the first is 60 against 50, and against the bound of 48
-    found = gaps(RULE, EXACT, "makespan")
-    assert found["gap_to_exact"] == {"mean": 20.0, "std": 0.0, "rounds": 1}
-    assert found["gap_to_bound"] == {"mean": 25.0, "std": 0.0, "rounds": 1}
-    assert gaps(scores([500.0, 500.0], [0.0, 0.0]), EXACT, "makespan")["gap_to_exact"]["mean"] is None
+    to_exact, to_bound = gaps(RULE, EXACT, "makespan")
+    assert to_exact == Gap(mean=20.0, std=0.0, rounds=1)
+    assert to_bound == Gap(mean=25.0, std=0.0, rounds=1)
+    assert gaps(scores([500.0, 500.0], [0.0, 0.0]), EXACT, "makespan")[0] == Gap(mean=None, std=None, rounds=0)
 
 
 def test_every_instance_has_a_row_that_says_how_the_solver_ended():
     rows = by_instance(Problem("murse", count=2), {"rule": RULE, "exact": EXACT})
-    assert [row["schedulers"]["rule"] for row in rows] == [
-        {"objective": 60.0, "feasible": 1.0},
-        {"objective": 500.0, "feasible": 0.0},
+    assert [row.schedulers["rule"] for row in rows] == [
+        InstanceScores(objective=60.0, feasible=1.0),
+        InstanceScores(objective=500.0, feasible=0.0),
     ]
-    exact = [row["schedulers"]["exact"] for row in rows]
-    assert [(one["status"], one["bound"], one["timed_out"], one["seconds"]) for one in exact] == [
+    exact = [row.schedulers["exact"] for row in rows]
+    assert [(one.status, one.bound, one.timed_out, one.seconds) for one in exact] == [
         ("feasible", 48.0, 1, 10.0),
         ("optimal", 80.0, 0, 0.5),
     ]

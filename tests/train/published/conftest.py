@@ -99,14 +99,14 @@ def write():
         for job in entries.all()[0]:
             inputs = job.inputs
             if isinstance(inputs, Bound):
-                made = {"M1": [0.8, 0.9], "needs": "failure model and clock"}
+                made = {"M1": [0.8, 0.9], "privileged_info": ["failure_model", "time_left"]}
             elif job.weights is not None:
                 training = Training(command="marl-sched train view=local", seed=3, view=LOCAL, knowledge="a teacher")
                 made = {"M1": [0.7, 0.8], "visible_share": 0.4, "training": training}
             else:
-                needs = "failure model" if inputs.scheduler == "model-based" else ""
+                known = ["failure_model"] if inputs.scheduler == "model-based" else []
                 share = 1.0 if inputs.view["kind"] == "full" else 0.5
-                made = {"M1": SCORES[inputs.scheduler], "visible_share": share, "needs": needs}
+                made = {"M1": SCORES[inputs.scheduler], "visible_share": share, "privileged_info": known}
             for wanted in (inputs, *job.besides):
                 cells.write(Cell(inputs=wanted, seconds=1.0, revision="", **made))
 

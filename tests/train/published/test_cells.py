@@ -88,7 +88,7 @@ def test_a_cell_holds_what_the_evaluation_of_its_inputs_gives():
     between = [np.mean([(x - row.mean()) ** 2 for x in row]) for row in profit]
     assert cell.episode_std == pytest.approx(np.sqrt(np.mean(between)), abs=5e-7)
     assert cell.visible_share == pytest.approx(scores.visible_share, abs=5e-7)
-    assert (cell.inputs, cell.needs, cell.training) == (PLAY, "", None)
+    assert (cell.inputs, cell.privileged_info, cell.training) == (PLAY, [], None)
 
 
 def test_a_scheme_is_played_as_the_inputs_say():
@@ -104,7 +104,7 @@ def test_a_proved_cell_is_not_below_the_bound():
     (cell,) = make(Job(BOUND))
     assert all(kept >= value for kept, value in zip(cell.M1, found.value, strict=True))
     np.testing.assert_allclose(cell.M1, found.value, rtol=0, atol=1.1e-6)
-    assert cell.needs == "failure model and clock"
+    assert str(cell.knows) == "failure model and clock"
 
 
 def test_what_is_written_is_read_and_says_its_inputs_in_clear(cells):
