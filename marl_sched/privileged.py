@@ -41,6 +41,15 @@ class PrivilegedInfo(Flag):
             found |= known[require("privileged information", name, known)]
         return found
 
+    @classmethod
+    def of_words(cls, text: str) -> PrivilegedInfo:
+        """What `str` gave; UnknownNameError for other words."""
+        known = {words: part for part, words in _IN_WORDS.items()}
+        found = cls.NONE
+        for words in text.replace(" and ", ", ").split(", ") if text else []:
+            found |= known[require("privileged information", words, known)]
+        return found
+
 
 _IN_WORDS = {
     PrivilegedInfo.FAILURE_MODEL: "failure model",

@@ -32,8 +32,10 @@ class Validation:
         self._problems = {
             scale: Problem(
                 self._domain,
-                instances=self._domain.instances(scale, validation.instances, validation.seed, "validation"),
-                pad=max(scales, key=list(self._domain.scales).index),  # whose padding some networks are bound to
+                scale=scale,
+                count=validation.instances,
+                split="validation",
+                pad=self._domain.largest_scale(scales),  # whose padding some networks are bound to
                 episodes=validation.episodes,
                 seed=validation.seed,
                 view=config.make_view(),

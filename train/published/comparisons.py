@@ -27,6 +27,7 @@ from marl_sched.errors import InvalidFileError, InvalidOptionError, UnknownNameE
 from marl_sched.files import replacing
 from marl_sched.problem import Problem, view_as_json
 from marl_sched.train.evaluation.evaluate import evaluate_scheduler
+from marl_sched.train.published.earlier import with_names
 from marl_sched.train.published.plan import Count, Seed
 
 SCHEMA = 1
@@ -128,6 +129,20 @@ class Inputs(_Part, frozen=True, kw_only=True):
     horizon: int
     schema: int = SCHEMA
 
+    def problem(self) -> Problem:
+        """What is played."""
+        return Problem(
+            self.env,
+            scale=self.scale,
+            count=self.instances,
+            episodes=1,
+            seed=self.seed,
+            view=self.view,
+            objective=self.objective,
+            horizon=self.horizon,
+            options=self.options,
+        )
+
     @property
     def name(self) -> str:
         """16 hexadecimal digits of the SHA-256 of the inputs as canonical JSON."""
@@ -142,9 +157,9 @@ class Cell(_Part, frozen=True, kw_only=True):
         objective: of each instance's rounds, an infeasible one charged as the domain does.
         feasible: of each instance's rounds, 1 or 0.
         visible_share: share of the graph that acting agents saw.
-        needs: what the scheduler uses beyond what its agents see.
-        command: that trained it, "" for a rule.
-        knowledge: what its training used.
+        privileged_info: what the scheduler uses beyond what its agents see, by the names of PrivilegedInfo.
+        command: that trained it, None for a rule.
+        knowledge: what its training used, in words; None for a rule.
         cpu_seconds: for all rounds, simulation included.
         revision: of the source that made it.
     """
@@ -153,9 +168,9 @@ class Cell(_Part, frozen=True, kw_only=True):
     objective: list[list[float]]
     feasible: list[list[int]]
     visible_share: float
-    needs: str
-    command: str = ""
-    knowledge: str = ""
+    privileged_info: list[str]
+    command: str | None = None
+    knowledge: str | None = None
     cpu_seconds: float
     revision: str
 
@@ -237,17 +252,7 @@ def _weights(env: str, name: str) -> str | None:
 
 def make(inputs: Inputs) -> Cell:
     """Play a cell: one episode of each instance. Time is taken after a short episode that compiles what is needed."""
-    problem = Problem(
-        inputs.env,
-        scale=inputs.scale,
-        count=inputs.instances,
-        episodes=1,
-        seed=inputs.seed,
-        view=inputs.view,
-        objective=inputs.objective,
-        horizon=inputs.horizon,
-        options=inputs.options,
-    )
+    problem = inputs.problem()
     scheduler = create_scheduler(inputs.scheduler, problem.domain, **inputs.settings)
     evaluate_scheduler(problem.but(count=min(_WARM_UP, inputs.instances), horizon=1), scheduler)
     started = time.process_time()
@@ -261,9 +266,9 @@ def make(inputs: Inputs) -> Cell:
         objective=[row[there].tolist() for row, there in zip(rounds[inputs.objective], played, strict=True)],
         feasible=[row[there].astype(int).tolist() for row, there in zip(rounds["feasible"], played, strict=True)],
         visible_share=round(scores.visible_share, 6),
-        needs=scores.needs,
-        command="" if card is None else card.command,
-        knowledge="" if card is None else card.training_knowledge,
+        privileged_info=scores.privileged_info.names,
+        command=None if card is None else card.command,
+        knowledge=None if card is None else card.training_knowledge,
         cpu_seconds=round(seconds, 4),
         revision=source_revision(),
     )
@@ -274,8 +279,8 @@ def read_cells(path: Path) -> dict[str, Cell]:
     found: dict[str, Cell] = {}
     for number, line in enumerate(path.read_bytes().splitlines() if path.exists() else [], start=1):
         try:
-            cell = msgspec.json.decode(line, type=Cell)
-        except (msgspec.DecodeError, msgspec.ValidationError) as error:
+            cell = msgspec.convert(with_names(msgspec.json.decode(line)), Cell)
+        except (msgspec.DecodeError, UnknownNameError) as error:
             raise InvalidFileError(path, f"line {number}", f"a cell of schema {SCHEMA} ({error})") from error
         found[cell.inputs.name] = cell
     return found

@@ -13,27 +13,15 @@ import io
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import msgspec
 from filelock import FileLock
 
-from marl_sched.errors import InvalidFileError, UnknownNameError, require
+from marl_sched.errors import InvalidFileError, UnknownNameError
 from marl_sched.files import replacing
 from marl_sched.kernels import sources_digest
 from marl_sched.train.published.cells import SCHEMA, Bound, Cell, Inputs, Job, describe, digest, make
-
-# What cells of version 0.1.0 say that a scheduler `needs`: their words -> the names of PrivilegedInfo.
-_NEEDS = {"": [], "failure model": ["failure_model"], "failure model and clock": ["failure_model", "time_left"]}
-
-
-def _renamed(cell: Any) -> Any:
-    """A cell as plain data, with `privileged_info` in the place of the `needs` of version 0.1.0."""
-    if not isinstance(cell, dict) or "needs" not in cell:
-        return cell
-    words = str(cell["needs"])
-    known = _NEEDS[require("need of a cell", words, _NEEDS)]
-    return {**{name: value for name, value in cell.items() if name != "needs"}, "privileged_info": known}
+from marl_sched.train.published.earlier import with_names
 
 
 class Cells:
@@ -56,7 +44,7 @@ class Cells:
             return found
         for number, line in enumerate(self.path.read_bytes().splitlines(), start=1):
             try:
-                cell = msgspec.convert(_renamed(msgspec.json.decode(line)), Cell)
+                cell = msgspec.convert(with_names(msgspec.json.decode(line)), Cell)
                 _ = cell.knows  # a name that nobody has is refused here, with the line
             except (msgspec.DecodeError, UnknownNameError) as error:
                 raise InvalidFileError(self.path, f"line {number}", f"a cell of schema {SCHEMA} ({error})") from error

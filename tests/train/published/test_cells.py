@@ -123,6 +123,20 @@ def test_what_is_written_is_read_and_says_its_inputs_in_clear(cells):
         ({"surplus": 1}, "a cell of schema 1"),
     ],
 )
+def test_a_cell_that_said_in_words_what_its_scheduler_needs_is_still_read(cells):
+    """As version 0.1.0 wrote them; words that nobody used are refused with the line."""
+    written = msgspec.structs.replace(make(Job(PLAY))[0], privileged_info=["failure_model", "time_left"])
+    cells.write(written)
+    text = cells.path.read_text()
+    old = text.replace('"privileged_info":["failure_model","time_left"]', '"needs":"failure model and clock"')
+    assert old != text
+    cells.path.write_text(old)
+    assert Cells(cells.path).read(PLAY) == written
+    cells.path.write_text(old.replace("failure model and clock", "luck"))
+    with pytest.raises(InvalidFileError, match=r"line 1: expected a cell of schema 1 .*unknown privileged information"):
+        Cells(cells.path)
+
+
 def test_a_damaged_cell_is_refused_by_name(cells, change, message):
     cells.write(Cell(inputs=PLAY, M1=[0.25, 0.5], seconds=1.0, revision=""))
     cells.path.write_text(json.dumps({**json.loads(cells.path.read_text()), **change}))

@@ -59,8 +59,8 @@ def cells(plan: Comparisons) -> dict[str, Cell]:
     for place in places(plan):
         objective, feasible = made_up[place.entry.label]
         found[place.inputs.name] = Cell(
-            inputs=place.inputs, objective=objective, feasible=feasible, visible_share=1.0, needs="", cpu_seconds=0.02,
-            revision="0123456789abcdef",
+            inputs=place.inputs, objective=objective, feasible=feasible, visible_share=1.0, privileged_info=[],
+            cpu_seconds=0.02, revision="0123456789abcdef",
         )  # fmt: skip
     return found
 
