@@ -131,7 +131,7 @@ def test_scores_are_printed_before_a_full_disk_is_met():
 
 def test_a_dash_gives_standard_output_to_the_json_alone():
     done = evaluate("--json", "-")
-    assert json.loads(done.stdout) == results()
+    assert json.loads(done.stdout) == json.loads(json.dumps(results().as_json()))
     assert b"0.7123" in done.stderr
 
 

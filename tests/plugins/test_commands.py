@@ -103,11 +103,11 @@ def test_it_is_trained_resumed_exported_drawn_and_deployed(run, tmp_path):
     policy = tmp_path / "mine.safetensors"
     ended = run(
         "deploy", "--env", "couriers-deployable", "--policy", policy, "--view", "near", "--reach", 2, "--seed", 3,
-        "--json", tmp_path / "run.json",
+        "--delay", 0.9, "--json", tmp_path / "run.json",
     )  # fmt: skip
     assert ended.code == 0, ended.err
     report = json.loads((tmp_path / "run.json").read_text())
-    assert report["M1"] == _in_one_process(policy, seed=3)
+    assert report["M1"] == _in_one_process(policy, seed=3, delay=0.9)
 
 
 @pytest.mark.slow
@@ -124,12 +124,13 @@ def test_it_is_trained_by_workers_of_ray_and_the_log_says_how_fast(run, tmp_path
     assert all(float(row["frames_per_second"]) > 0 for rows in logs.values() for row in rows)
 
 
-def _in_one_process(policy, seed):
+def _in_one_process(policy, seed, delay):
     from marl_sched.agents.playing import play
     from marl_sched.agents.registry import create_scheduler
     from marl_sched.problem import Problem
 
-    problem = Problem("couriers-deployable", count=1, seed=seed, view={"kind": "near", "reach": 2})
+    view, options = {"kind": "near", "reach": 2}, {"delay": delay}
+    problem = Problem("couriers-deployable", count=1, seed=seed, view=view, options=options)
     simulator = play(create_scheduler(policy, problem.domain), problem.simulator())
     return float(simulator.objectives()["waiting"][0])
 
