@@ -9,7 +9,7 @@ PYTEST_ARGS ?= -n auto --dist worksteal
 
 WORKERS ?= 2
 
-.PHONY: help demo test unit wheel lint coverage tables-airme tables-murse format clean
+.PHONY: help demo test unit wheel lint docs docs-serve coverage tables-airme tables-murse format clean
 
 help: ## what there is to make
 	@grep -hE '^[a-z%-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z%-]+):.*## (.*)/  \1|\2/' | column -t -s '|'
@@ -39,6 +39,13 @@ lint: $(INSTALLED) ## style, formatting, spelling, types
 	$(BIN)/ruff format --check .
 	$(BIN)/codespell
 	$(BIN)/mypy -p marl_sched
+
+docs: export NO_MKDOCS_2_WARNING = 1
+docs: $(INSTALLED) ## the documentation site in build/site/, every warning an error
+	$(BIN)/python -m mkdocs build
+
+docs-serve: $(INSTALLED) ## the same on localhost, renewed with every change
+	$(BIN)/python -m mkdocs serve
 
 coverage: $(INSTALLED) ## which lines of what is not compiled no test runs, in build/coverage/
 	OMP_NUM_THREADS=1 NUMBA_CACHE_DIR=$(CURDIR)/build/numba $(BIN)/pytest --cov --cov-report=term:skip-covered \
@@ -104,5 +111,5 @@ clean: ## remove everything that these commands made, results in out/ excepted
 $(INSTALLED): pyproject.toml setup.py constraints.txt
 	@test -n "$(PYTHON)" || { echo "marl_sched needs Python 3.11 or newer: make PYTHON=/path/to/python" >&2; exit 2; }
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[all,test]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[all,test,docs]'
 	touch $@

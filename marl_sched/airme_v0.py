@@ -1,6 +1,6 @@
 """AirME: crews decide which aircraft to maintain next, before or after it breaks.
 
-![timeline of a fleet](../docs/images/airme.png)
+![timeline of a fleet](../images/airme.png)
 
 A fleet of fixed-wing aircraft and helicopters flies missions. Every flying hour wears parts whose failure model
 (Weibull, hidden from the agents) makes a plane more likely to break; a broken plane earns nothing and takes

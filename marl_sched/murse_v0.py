@@ -1,6 +1,6 @@
 """MuRSE: robots and humans share out tasks under deadlines, waits and safety distances, round after round.
 
-![Gantt chart of a round](../docs/images/murse.png)
+![Gantt chart of a round](../images/murse.png)
 
 A team has a list of tasks at places on a map. A task has a duration for each agent, perhaps a deadline, perhaps
 others that it has to wait for; tasks that lie close together must not be done at the same time. Humans take less

@@ -7,8 +7,9 @@ dissertation linearises the same problem for a MILP solver; intervals need no bi
 
 from __future__ import annotations
 
+import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -140,15 +141,23 @@ def require_limits(name: str, work_limit: float | None, time_limit: float | None
 def _run(solver: Any, model: Any) -> Any:
     """The status of a run in a thread of its own: the main thread stays free to take Ctrl-C, and then ends the run."""
     solver.parameters.catch_sigint_signal = False
-    with ThreadPoolExecutor(1) as pool:
-        running = pool.submit(solver.solve, model)
+    outcome: Future[Any] = Future()
+
+    def solve_model() -> None:
         try:
-            return running.result()
-        except BaseException:
-            while not running.done():  # a run that has not begun yet cannot be stopped
-                solver.stop_search()
-                time.sleep(_STOPPING_SECONDS)
-            raise
+            outcome.set_result(solver.solve(model))
+        except BaseException as error:  # raised again where the outcome is read
+            outcome.set_exception(error)
+
+    running = threading.Thread(target=solve_model, name="cp-sat")
+    try:
+        running.start()
+        return outcome.result()
+    except BaseException:
+        while running.is_alive():  # a run that has not begun yet cannot be stopped
+            solver.stop_search()
+            time.sleep(_STOPPING_SECONDS)
+        raise
 
 
 class _Model:

@@ -63,7 +63,9 @@ class SchedulingTorchRL(SavesState, EnvBase):
             None pads to `instances`.
         instances: one per row, or files of such.
         source: gives a row's instance at each of its resets, and once more when the environment is made.
-        view, objective, horizon: see Problem; None is the domain's default.
+        view: what an acting agent sees, as every domain's simulator takes it; None is the domain's default.
+        objective: what the reward follows; None is the domain's default.
+        horizon: length of an episode in the domain's unit; None is the domain's default.
         seed: of instances and noise; `set_seed` sets another, for each row from its next reset on. None draws one
             from the operating system's entropy. Random actions follow `torch.manual_seed`, as everywhere in TorchRL.
         split: "train", "validation" or "test".
