@@ -6,6 +6,10 @@ digest of all their sources:
 
     <NUMBA_CACHE_DIR, or the user's cache directory>/marl_sched/kernels/<digest>
 
+The digest stands for the sources, wherever they lie and whenever they were written: another checkout, a new
+installation of the same version or an image that was built from it finds what is compiled already. Kernels of other
+distributions are kept there too, by the path and the time of their own file, as Numba does.
+
 A cache directory that cannot be written (a read-only installation without a home) is replaced by one in the folder
 for temporary files; a cache file that is damaged is compiled anew; a full disk costs the cache, not the run. Each is
 logged as a warning on the logger `marl_sched.kernels`.
@@ -28,7 +32,7 @@ from typing import Any
 
 import numba
 import platformdirs
-from numba.core.caching import FunctionCache
+from numba.core.caching import CacheImpl, CompileResultCacheImpl, FunctionCache, _CacheLocator
 from numba.core.dispatcher import Dispatcher
 
 log = logging.getLogger(__name__)
@@ -62,8 +66,39 @@ def _cache_of(function: Callable[..., Any]) -> FunctionCache:
         config.CACHE_DIR = before
 
 
+class _SourcesLocator(_CacheLocator):
+    """Where the code of one of this package's kernels is kept: by its module's name, fresh as long as the digest is."""
+
+    def __init__(self, function: Any, file: str) -> None:
+        self._py_file = file  # Numba's warnings name it
+        self._module, self._line = function.__module__, function.__code__.co_firstlineno
+
+    def get_cache_path(self) -> str:
+        """The folder of the kernel's module."""
+        return str(cache_folder() / self._module)
+
+    def get_source_stamp(self) -> str:
+        """The digest of all kernel sources."""
+        return sources_digest()
+
+    def get_disambiguator(self) -> str:
+        """The line, for functions of one name in a module."""
+        return str(self._line)
+
+    @classmethod
+    def from_function(cls, function: Any, file: str) -> _SourcesLocator | None:
+        """None for a function whose source the digest does not cover."""
+        return cls(function, file) if Path(file).resolve() in _covered() else None
+
+
+class _KernelCacheImpl(CompileResultCacheImpl):
+    _locator_classes = (_SourcesLocator, *CacheImpl._locator_classes)
+
+
 class _KernelCache(FunctionCache):
     """Numba's cache of one function, for which a damaged file or a full disk is no reason to stop."""
+
+    _impl_class = _KernelCacheImpl
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """The machine code of a signature, None if there is none that can be read."""
@@ -97,11 +132,20 @@ def sources_digest() -> str:
     Two runs with the same digest computed with the same simulators.
     """
     digest = hashlib.sha256(f"numba {numba.__version__}".encode())
-    for path in _sources():
-        content = path.read_bytes()
-        if _MARK in content:
-            digest.update(path.name.encode() + b"\0" + content + b"\0")
+    for path in _kernel_sources():
+        digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
     return digest.hexdigest()[:16]
+
+
+@functools.cache
+def _covered() -> frozenset[Path]:
+    """The files that the digest is made of."""
+    return frozenset(path.resolve() for path in _kernel_sources())
+
+
+@functools.cache
+def _kernel_sources() -> tuple[Path, ...]:
+    return tuple(path for path in _sources() if _MARK in path.read_bytes())
 
 
 def _sources() -> list[Path]:
@@ -126,7 +170,7 @@ def cache_folder() -> Path:
     given = os.environ.get("NUMBA_CACHE_DIR")
     usual = Path(given) / "marl_sched" if given else platformdirs.user_cache_path("marl_sched")
     for parent, private in ((usual, False), (Path(tempfile.gettempdir()) / f"marl_sched-{_user()}", True)):
-        folder = parent / "kernels" / sources_digest()
+        folder = parent / "kernels" / f"{sources_digest()}{_settings()}"
         try:
             parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             if private and not _is_ours(parent):
@@ -140,6 +184,15 @@ def cache_folder() -> Path:
         _remove_unused(folder)
         return folder
     return Path(tempfile.mkdtemp(prefix="marl_sched-kernels-"))
+
+
+def _settings() -> str:
+    """What of Numba's settings makes other code of the same sources; "" for the usual ones."""
+    config: Any = numba.config
+    checked, debug, level = bool(config.BOUNDSCHECK), bool(config.DEBUGINFO_DEFAULT), int(config.OPT)
+    return (
+        ("-boundscheck" if checked else "") + ("-debuginfo" if debug else "") + (f"-opt{level}" if level != 3 else "")
+    )
 
 
 def _user() -> str:

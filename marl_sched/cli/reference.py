@@ -16,7 +16,14 @@ def commands_as_markdown() -> str:
 
 
 def _section(name: str, command: Any) -> str:
-    lines = [f"## marl-sched {name}", "", _one_line(command.help), "", "| option | default | meaning |", "|---|---|---|"]
+    lines = [
+        f"## marl-sched {name}",
+        "",
+        _one_line(command.help),
+        "",
+        "| option | default | meaning |",
+        "|---|---|---|",
+    ]
     lines += [_row(parameter) for parameter in command.params]
     if command.epilog:
         lines += ["", "```text", command.epilog.removeprefix("Example: "), "```"]

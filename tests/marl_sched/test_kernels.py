@@ -59,6 +59,33 @@ def test_an_edit_in_another_file_is_noticed_and_without_one_the_cache_is_used(ch
     assert run(code, NUMBA_CACHE_DIR=cache).stdout.split() == ["30", "0"]
 
 
+def test_the_same_sources_in_another_place_and_written_later_find_what_is_compiled(checkout: Path) -> None:
+    cache, elsewhere = str(checkout / "cache"), checkout / "elsewhere"
+    assert run(USE.format(folder=str(checkout)), NUMBA_CACHE_DIR=cache).stdout.split() == ["20", "0"]
+    elsewhere.mkdir()
+    (elsewhere / "lower.py").write_text(LOWER)
+    (elsewhere / "upper.py").write_text(UPPER)
+    os.utime(elsewhere / "upper.py", (0, 0))
+    assert run(USE.format(folder=str(elsewhere)), NUMBA_CACHE_DIR=cache).stdout.split() == ["20", "1"]
+
+
+def test_settings_that_change_the_code_have_a_cache_of_their_own(checkout: Path) -> None:
+    code, cache = USE.format(folder=str(checkout)), str(checkout / "cache")
+    assert run(code, NUMBA_CACHE_DIR=cache).stdout.split() == ["20", "0"]
+    assert run(code, NUMBA_CACHE_DIR=cache, NUMBA_BOUNDSCHECK="1").stdout.split() == ["20", "0"]
+    assert run(code, NUMBA_CACHE_DIR=cache, NUMBA_BOUNDSCHECK="1").stdout.split() == ["20", "1"]
+
+
+def test_kernels_of_another_distribution_are_kept_by_their_own_file(checkout: Path) -> None:
+    code = f"import sys; sys.path.insert(0, {str(checkout)!r}); from upper import upper; print(upper(1))"
+    code += "; print(sum(upper.stats.cache_hits.values()))"
+    cache = str(checkout / "cache")
+    assert run(code, NUMBA_CACHE_DIR=cache).stdout.split() == ["20", "0"]
+    assert run(code, NUMBA_CACHE_DIR=cache).stdout.split() == ["20", "1"]
+    (checkout / "upper.py").write_text(UPPER.replace("10 *", "100 *"))
+    assert run(code, NUMBA_CACHE_DIR=cache).stdout.split() == ["200", "0"]
+
+
 @pytest.mark.parametrize("content", [b"", b"no pickle", b"\x80\x04N."])
 def test_a_damaged_cache_is_compiled_anew_and_said(checkout: Path, content: bytes) -> None:
     code, cache = USE.format(folder=str(checkout)), checkout / "cache"
