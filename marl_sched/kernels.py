@@ -92,7 +92,7 @@ class _SourcesLocator(_CacheLocator):
 
 
 class _KernelCacheImpl(CompileResultCacheImpl):
-    _locator_classes = (_SourcesLocator, *CacheImpl._locator_classes)
+    _locator_classes: list[type[object]] = [_SourcesLocator, *CacheImpl._locator_classes]  # noqa: RUF012  (as Numba has it)
 
 
 class _KernelCache(FunctionCache):

@@ -167,7 +167,7 @@ from marl_sched.envs.murse.generate import generate
 
 exact.ortools()  # imported before the interrupt, which comes half a second on
 whole = Round.of(generate("heterogeneous-10-large", np.random.default_rng(0)))
-# Kernels are loaded first: CPython ends by SIGINT when an interrupt has left an `exec`, as Numba uses it, caught or not.
+# Kernels are loaded first: CPython ends by SIGINT once an interrupt has left an `exec`, as Numba's, even if caught.
 exact.solve(Round.of(generate("small", np.random.default_rng(0))), work_limit=0.01)
 print("solving", flush=True)
 threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()
