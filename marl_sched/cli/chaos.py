@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 def add_to(app: typer.Typer) -> None:
     """Register this file's command."""
-    example = "Example: marl-sched chaos --env airme --case killed --json chaos.json"
+    example = f"Example: marl-sched chaos --env {options.DEFAULT_ENV} --case killed --json chaos.json"
     app.command(epilog=example, context_settings=DOMAIN_OPTIONS)(takes(Team)(chaos))
 
 
