@@ -1,14 +1,13 @@
-"""Compiled kernels: Numba's `njit` with a cache that notices an edit in any kernel's source.
+"""Compiled kernels: Numba's `njit` with a cache that notices an edit in any source of a kernel.
 
 Numba keys its file cache by the file that holds a function, so a kernel that calls one from another file keeps the
-old code of the other when that is edited. Kernels of this package are therefore cached in a folder whose name is a
-digest of all their sources:
+old code of the other when that is edited. Kernels of this package are therefore cached in a folder that is named after
+their module and a digest of everything that the module is made from (marl_sched.kernel_sources):
 
-    <NUMBA_CACHE_DIR, or the user's cache directory>/marl_sched/kernels/<digest>
+    <NUMBA_CACHE_DIR, or the user's cache directory>/marl_sched/kernels/<module>-<digest>
 
 The digest stands for the sources, wherever they lie and whenever they were written: another checkout, a new
-installation of the same version or an image that was built from it finds what is compiled already. Kernels of other
-distributions are kept there too, by the path and the time of their own file, as Numba does.
+installation of the same version or an image that was built from it finds what is compiled already.
 
 A cache directory that cannot be written (a read-only installation without a home) is replaced by one in the folder
 for temporary files; a cache file that is damaged is compiled anew; a full disk costs the cache, not the run. Each is
@@ -18,7 +17,6 @@ logged as a warning on the logger `marl_sched.kernels`.
 from __future__ import annotations
 
 import functools
-import hashlib
 import logging
 import os
 import pickle  # noqa: TID251  (Numba's own cache files are pickles; here only their errors are named)
@@ -26,7 +24,6 @@ import stat
 import tempfile
 import time
 from collections.abc import Callable
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -35,10 +32,10 @@ import platformdirs
 from numba.core.caching import CacheImpl, CompileResultCacheImpl, FunctionCache, _CacheLocator
 from numba.core.dispatcher import Dispatcher
 
+from marl_sched.kernel_sources import sources, sources_digest
+
 log = logging.getLogger(__name__)
 
-_PACKAGES = ("marl_sched", "marl_sched.envs", "marl_sched.agents")
-_MARK = b"marl_sched.kernels"
 _UNUSED_AFTER = 30 * 24 * 3600  # seconds
 _DAMAGED = (EOFError, pickle.UnpicklingError, AttributeError, ImportError, IndexError, KeyError, TypeError, ValueError)
 
@@ -67,7 +64,7 @@ def _cache_of(function: Callable[..., Any]) -> FunctionCache:
 
 
 class _SourcesLocator(_CacheLocator):
-    """Where the code of one of this package's kernels is kept: by its module's name, fresh as long as the digest is."""
+    """Where a kernel's code is kept: by its module's name, fresh as long as the digest of the module's sources is."""
 
     def __init__(self, function: Any, file: str) -> None:
         self._py_file = file  # Numba's warnings name it
@@ -75,11 +72,11 @@ class _SourcesLocator(_CacheLocator):
 
     def get_cache_path(self) -> str:
         """The folder of the kernel's module."""
-        return str(cache_folder() / self._module)
+        return str(_module_folder(self._module))
 
     def get_source_stamp(self) -> str:
-        """The digest of all kernel sources."""
-        return sources_digest()
+        """The digest of the module's sources."""
+        return sources_digest(self._module)
 
     def get_disambiguator(self) -> str:
         """The line, for functions of one name in a module."""
@@ -87,8 +84,8 @@ class _SourcesLocator(_CacheLocator):
 
     @classmethod
     def from_function(cls, function: Any, file: str) -> _SourcesLocator | None:
-        """None for a function whose source the digest does not cover."""
-        return cls(function, file) if Path(file).resolve() in _covered() else None
+        """None for a function of no file, such as one that was typed at a prompt: Numba has places for such."""
+        return cls(function, file) if sources(function.__module__) else None
 
 
 class _KernelCacheImpl(CompileResultCacheImpl):
@@ -126,51 +123,12 @@ class _KernelCache(FunctionCache):
 
 
 @functools.cache
-def sources_digest() -> str:
-    """The first 16 hex digits of a SHA-256 over every source file of the package that defines or imports kernels.
-
-    Two runs with the same digest computed with the same simulators.
-    """
-    digest = hashlib.sha256(f"numba {numba.__version__}".encode())
-    for path in _kernel_sources():
-        digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
-    return digest.hexdigest()[:16]
-
-
-@functools.cache
-def _covered() -> frozenset[Path]:
-    """The files that the digest is made of."""
-    return frozenset(path.resolve() for path in _kernel_sources())
-
-
-@functools.cache
-def _kernel_sources() -> tuple[Path, ...]:
-    return tuple(path for path in _sources() if _MARK in path.read_bytes())
-
-
-def _sources() -> list[Path]:
-    """The package's Python files, each once, in an order that does not depend on where it is installed."""
-    found: dict[tuple[str, str], Path] = {}
-    for package in _PACKAGES:
-        spec = find_spec(package)
-        for folder in (spec.submodule_search_locations or []) if spec is not None else []:
-            for path in Path(folder).rglob("*.py"):
-                name = path.relative_to(folder).as_posix()
-                room, _, inside = name.partition("/")
-                if package == "marl_sched" and f"marl_sched.{room}" in _PACKAGES:
-                    found[f"marl_sched.{room}", inside] = path  # a wheel holds the rooms inside the package
-                else:
-                    found[package, name] = path
-    return [found[key] for key in sorted(found)]
-
-
-@functools.cache
 def cache_folder() -> Path:
     """Where compiled kernels are kept, made if it was not there; see the module's page."""
     given = os.environ.get("NUMBA_CACHE_DIR")
     usual = Path(given) / "marl_sched" if given else platformdirs.user_cache_path("marl_sched")
     for parent, private in ((usual, False), (Path(tempfile.gettempdir()) / f"marl_sched-{_user()}", True)):
-        folder = parent / "kernels" / f"{sources_digest()}{_settings()}"
+        folder = parent / "kernels"
         try:
             parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             if private and not _is_ours(parent):
@@ -180,10 +138,21 @@ def cache_folder() -> Path:
         except OSError as error:
             log.warning("compiled kernels cannot be kept in %s: %s", folder, error)
             continue
-        os.utime(folder)
         _remove_unused(folder)
         return folder
     return Path(tempfile.mkdtemp(prefix="marl_sched-kernels-"))
+
+
+@functools.cache
+def _module_folder(module: str) -> Path:
+    """Where the kernels of a module are kept, touched, so that it counts as used."""
+    folder = cache_folder() / f"{module}-{sources_digest(module)}{_settings()}"
+    try:
+        folder.mkdir(exist_ok=True)
+        os.utime(folder)
+    except OSError as error:  # a full disk: what is compiled is not kept, which the cache says when it tries to
+        log.debug("%s cannot be made or touched: %s", folder, error)
+    return folder
 
 
 def _settings() -> str:
@@ -209,8 +178,8 @@ def _is_ours(folder: Path) -> bool:
 
 def _remove_unused(folder: Path) -> None:
     """Remove the kernels of sources that nobody has used for a month."""
-    for other in folder.parent.iterdir():
-        if other != folder and other.is_dir() and time.time() - other.stat().st_mtime > _UNUSED_AFTER:
+    for other in folder.iterdir():
+        if other.is_dir() and time.time() - other.stat().st_mtime > _UNUSED_AFTER:
             for path in sorted(other.rglob("*"), reverse=True):
                 _remove(path)
             _remove(other)

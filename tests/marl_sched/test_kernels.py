@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from marl_sched import kernel_sources
+
 ROOT = Path(__file__).resolve().parents[2]
 LOWER = """
 from marl_sched.kernels import kernel
@@ -16,8 +18,8 @@ def lower(x):
     return x + 1
 """
 UPPER = """
-from lower import lower
 from marl_sched.kernels import kernel
+from probe.lower import lower
 
 @kernel
 def upper(x):
@@ -31,22 +33,26 @@ def run(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, env={**variables, **environment}, capture_output=True, text=True, timeout=200)
 
 
+def write_package(folder: Path) -> Path:
+    """A distribution of two modules with kernels, one of which calls the other's."""
+    package = folder / "probe"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "lower.py").write_text(LOWER)
+    (package / "upper.py").write_text(UPPER)
+    (package / "aside.py").write_text("EDITED = 0\n")
+    return folder
+
+
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
-    """Two modules with kernels, one of which calls the other's, as part of the sources that the digest covers."""
-    (tmp_path / "lower.py").write_text(LOWER)
-    (tmp_path / "upper.py").write_text(UPPER)
-    return tmp_path
+    return write_package(tmp_path)
 
 
 USE = """
 import sys
-from pathlib import Path
 sys.path.insert(0, {folder!r})
-from marl_sched import kernels
-package_sources = kernels._sources
-kernels._sources = lambda: [*package_sources(), Path({folder!r}) / "lower.py", Path({folder!r}) / "upper.py"]
-from upper import upper
+from probe.upper import upper
 print(upper(1), sum(upper.stats.cache_hits.values()))
 """
 
@@ -54,8 +60,9 @@ print(upper(1), sum(upper.stats.cache_hits.values()))
 def test_an_edit_in_another_file_is_noticed_and_without_one_the_cache_is_used(checkout: Path) -> None:
     code, cache = USE.format(folder=str(checkout)), str(checkout / "cache")
     assert run(code, NUMBA_CACHE_DIR=cache).stdout.split() == ["20", "0"]
+    (checkout / "probe" / "aside.py").write_text("EDITED = 1\n")  # nothing that the kernels are made from
     assert run(code, NUMBA_CACHE_DIR=cache).stdout.split() == ["20", "1"]
-    (checkout / "lower.py").write_text(LOWER.replace("x + 1", "x + 2"))
+    (checkout / "probe" / "lower.py").write_text(LOWER.replace("x + 1", "x + 2"))
     assert run(code, NUMBA_CACHE_DIR=cache).stdout.split() == ["30", "0"]
 
 
@@ -63,9 +70,8 @@ def test_the_same_sources_in_another_place_and_written_later_find_what_is_compil
     cache, elsewhere = str(checkout / "cache"), checkout / "elsewhere"
     assert run(USE.format(folder=str(checkout)), NUMBA_CACHE_DIR=cache).stdout.split() == ["20", "0"]
     elsewhere.mkdir()
-    (elsewhere / "lower.py").write_text(LOWER)
-    (elsewhere / "upper.py").write_text(UPPER)
-    os.utime(elsewhere / "upper.py", (0, 0))
+    write_package(elsewhere)
+    os.utime(elsewhere / "probe" / "upper.py", (0, 0))
     assert run(USE.format(folder=str(elsewhere)), NUMBA_CACHE_DIR=cache).stdout.split() == ["20", "1"]
 
 
@@ -76,14 +82,22 @@ def test_settings_that_change_the_code_have_a_cache_of_their_own(checkout: Path)
     assert run(code, NUMBA_CACHE_DIR=cache, NUMBA_BOUNDSCHECK="1").stdout.split() == ["20", "1"]
 
 
-def test_kernels_of_another_distribution_are_kept_by_their_own_file(checkout: Path) -> None:
-    code = f"import sys; sys.path.insert(0, {str(checkout)!r}); from upper import upper; print(upper(1))"
-    code += "; print(sum(upper.stats.cache_hits.values()))"
-    cache = str(checkout / "cache")
+def test_a_module_is_made_from_what_it_imports_and_from_nothing_else() -> None:
+    found = kernel_sources.sources("marl_sched.envs.murse.views")
+    assert {"marl_sched.envs.murse.views", "marl_sched.envs.murse.instance", "marl_sched.kernels"} <= set(found)
+    assert not any("airme" in name or "agents" in name for name in found)
+    assert all(path.is_file() for path in found.values())
+    assert kernel_sources.sources("builtins") == {}
+
+
+def test_the_cache_changes_with_a_constant_of_another_module(checkout: Path) -> None:
+    code, cache = USE.format(folder=str(checkout)), str(checkout / "cache")
+    (checkout / "probe" / "constants.py").write_text("STEP = 1\n")
+    lower = LOWER.replace("x + 1", "x + STEP")
+    (checkout / "probe" / "lower.py").write_text(f"from probe.constants import (\n    STEP,\n)\n{lower}")
     assert run(code, NUMBA_CACHE_DIR=cache).stdout.split() == ["20", "0"]
-    assert run(code, NUMBA_CACHE_DIR=cache).stdout.split() == ["20", "1"]
-    (checkout / "upper.py").write_text(UPPER.replace("10 *", "100 *"))
-    assert run(code, NUMBA_CACHE_DIR=cache).stdout.split() == ["200", "0"]
+    (checkout / "probe" / "constants.py").write_text("STEP = 2\n")
+    assert run(code, NUMBA_CACHE_DIR=cache).stdout.split() == ["30", "0"]
 
 
 @pytest.mark.parametrize("content", [b"", b"no pickle", b"\x80\x04N."])

@@ -11,6 +11,7 @@ import hashlib
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from marl_sched.agents.policies.cards import read_card, source_revision
 from marl_sched.agents.registry import create_scheduler
 from marl_sched.domain import get_domain
 from marl_sched.errors import InvalidFileError, InvalidOptionError
-from marl_sched.kernels import sources_digest
+from marl_sched.kernel_sources import sources_digest
 from marl_sched.privileged import PrivilegedInfo
 from marl_sched.problem import Problem
 from marl_sched.train.evaluation.evaluate import evaluate_scheduler
@@ -209,7 +210,7 @@ def _play(inputs: Play, weights: Path | None, besides: Sequence[Play]) -> list[C
             training=training,
             seconds=round(scores.seconds, 1),
             revision=revision,
-            kernels=sources_digest(),
+            kernels=kernels_of(inputs.env),
         )
         for wanted in (inputs, *besides)
         for m1 in (scores.measures[wanted.objective],)
@@ -231,8 +232,16 @@ def _prove(inputs: Bound) -> Cell:
         privileged_info=domain.bound_info.names,
         seconds=round(time.perf_counter() - started, 1),
         revision=source_revision(),
-        kernels=sources_digest(),
+        kernels=kernels_of(inputs.env),
     )
+
+
+@cache
+def kernels_of(env: str) -> str:
+    """The digest of what a domain's simulator and rules are made from (marl_sched.kernel_sources)."""
+    domain = get_domain(env)
+    rules = domain.schedulers.partition(":")[0] if isinstance(domain.schedulers, str) else domain.simulator.__module__
+    return sources_digest(domain.simulator.__module__, rules)
 
 
 def _rounded(values: np.ndarray, *, up: bool = False) -> list[float]:

@@ -2,9 +2,9 @@
 
     docs/results/airme/cells.jsonl
 
-A cell also says with which kernels it was made (`marl_sched.kernels.sources_digest`). Under other kernels it is stale:
-it may still be drawn, and before it is mixed with new ones a sample of the stale cells is played again (`confirm`). If
-all of the sample agree the others are taken over, otherwise every stale cell is made anew.
+A cell also says from which sources its domain's simulator and rules were made (`kernels_of`). Under other sources it is
+stale: it may still be drawn, and before it is mixed with new ones a sample of the stale cells is played again
+(`confirm`). If all of the sample agree the others are taken over, otherwise every stale cell is made anew.
 """
 
 from __future__ import annotations
@@ -19,8 +19,7 @@ from filelock import FileLock
 
 from marl_sched.errors import InvalidFileError, UnknownNameError
 from marl_sched.files import replacing
-from marl_sched.kernels import sources_digest
-from marl_sched.train.published.cells import SCHEMA, Bound, Cell, Inputs, Job, describe, digest, make
+from marl_sched.train.published.cells import SCHEMA, Bound, Cell, Inputs, Job, describe, digest, kernels_of, make
 from marl_sched.train.published.earlier import with_names
 
 
@@ -91,7 +90,7 @@ class Cells:
 
     def stale(self) -> list[Cell]:
         """The cells that were made with other kernels than those of the running source."""
-        return [cell for cell in self if cell.kernels != sources_digest()]
+        return [cell for cell in self if cell.kernels != kernels_of(cell.inputs.env)]
 
     def revisions(self) -> dict[str, int]:
         """Source revision -> how many of the cells it made, most first."""
@@ -118,5 +117,5 @@ def confirm(cells: Cells, jobs: Iterable[Job], sample: int) -> list[str]:
     if differing or not chosen:
         cells.remove(*(cell.inputs for cell in stale.values()))
     else:
-        cells.write(*(msgspec.structs.replace(cell, kernels=sources_digest()) for cell in stale.values()))
+        cells.write(*(msgspec.structs.replace(cell, kernels=kernels_of(cell.inputs.env)) for cell in stale.values()))
     return differing

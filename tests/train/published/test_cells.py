@@ -115,14 +115,6 @@ def test_what_is_written_is_read_and_says_its_inputs_in_clear(cells):
     assert cells.read(BOUND) is None
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"M1": [0.5]}, "M1: expected 2 numbers"),
-        ({"M1": ["high", 0.5]}, "a cell of schema 1"),
-        ({"surplus": 1}, "a cell of schema 1"),
-    ],
-)
 def test_a_cell_that_said_in_words_what_its_scheduler_needs_is_still_read(cells):
     """As version 0.1.0 wrote them; words that nobody used are refused with the line."""
     written = msgspec.structs.replace(make(Job(PLAY))[0], privileged_info=["failure_model", "time_left"])
@@ -137,6 +129,14 @@ def test_a_cell_that_said_in_words_what_its_scheduler_needs_is_still_read(cells)
         Cells(cells.path)
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"M1": [0.5]}, "M1: expected 2 numbers"),
+        ({"M1": ["high", 0.5]}, "a cell of schema 1"),
+        ({"surplus": 1}, "a cell of schema 1"),
+    ],
+)
 def test_a_damaged_cell_is_refused_by_name(cells, change, message):
     cells.write(Cell(inputs=PLAY, M1=[0.25, 0.5], seconds=1.0, revision=""))
     cells.path.write_text(json.dumps({**json.loads(cells.path.read_text()), **change}))
