@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -54,7 +55,8 @@ def save_best(
 def knowledge(record: RunRecord) -> str:
     """What a run uses beyond the policy's view, the runs that it goes on from included."""
     config = record.config
-    used = record.start.knowledge.split(", ") if record.start is not None and record.start.knowledge else []
+    before = record.start.knowledge if record.start is not None else ""
+    used = re.split(r", (?![^()]*\))", before) if before else []  # a teacher's knowledge has commas in brackets
     used += config.algorithm.knowledge(config)
     return ", ".join(dict.fromkeys(used))
 
