@@ -8,5 +8,5 @@ The protocol is written down in `comms/PROTOCOL.md`, where every failure has a n
 `agent.py` drive it by a clock and a network: Zenoh (`transport/`), or one in memory (`inproc.py`), with which a whole
 deployment runs in one process. `launcher.py` starts and restarts processes, which are forked from `fork_server.py`;
 `decision_log.py` keeps what was decided; `security/` makes certificates and says who may say and hear what;
-`metrics/` counts and reports.
+`metrics/` counts and reports. `dashboard/` shows a running deployment, `chaos/` lets faults and attacks happen to one.
 """

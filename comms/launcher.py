@@ -18,7 +18,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import FrameType
@@ -312,9 +312,14 @@ def _world_died(code: int) -> bool:
     return code < 0 or code == ExitCode.DEFECT
 
 
-def deploy(options: DeployOptions, progress: Progress | None = None) -> RunReport:
+def deploy(
+    options: DeployOptions,
+    progress: Progress | None = None,
+    beside: Callable[[Deployment], AbstractContextManager[object]] = nullcontext,
+) -> RunReport:
     """Play one run with every agent as a process of its own; the report, with the seconds it took in all.
 
+    `beside(deployment)` is entered when the processes have been started, and left before they are ended.
     It is also written to `options.world.report` if that is set, whatever the end, but not if the start was refused.
     Raises UnknownNameError, InvalidOptionError and InvalidFileError for what cannot be deployed, DeploymentError if the
     endpoint is in use, or naming the process that failed. SIGINT, SIGTERM and SIGHUP end all processes and then this
@@ -331,7 +336,8 @@ def deploy(options: DeployOptions, progress: Progress | None = None) -> RunRepor
             deployment = Deployment(options)
             with deployment:
                 stopped.waiting = True
-                report = deployment.wait(progress, lambda: stopped.number)
+                with beside(deployment):
+                    report = deployment.wait(progress, lambda: stopped.number)
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else int(ExitCode.DEFECT)
         reason = f"signal {code - 128}" if code > 128 else f"the caller ended it: {end.code}"

@@ -27,7 +27,7 @@ from marl_sched.errors import MarlSchedError
 
 POLL = 0.02  # seconds between two looks
 START_TICK = 20  # the first faults come when the run has come so far
-PATIENCE = 60.0  # seconds after which a run that does not go on has failed
+PATIENCE = 240.0  # seconds after which a run that does not go on has failed
 PRESENT = ("ready", "asked")
 
 

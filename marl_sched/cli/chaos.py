@@ -71,7 +71,7 @@ def chaos(
     json: options.JsonFile = None,
 ) -> None:
     """Let things go wrong in a deployment, hold its log against the invariants, and say what it cost."""
-    from marl_sched.comms.chaos.campaign import as_json, campaign, exit_code, fuzz_row, stops_row, table
+    from marl_sched.comms.chaos.campaign import Row, as_json, campaign, exit_code, fuzz_row, stops_row, table
     from marl_sched.comms.chaos.cases import CASES
     from marl_sched.domain import get_domain
     from marl_sched.files import write_json
@@ -86,14 +86,20 @@ def chaos(
     if not chosen:
         raise InvalidOptionError(f"--case: expected a part of one of {', '.join(one.name for one in CASES)}")
     with tempfile.TemporaryDirectory(prefix="marl_sched-chaos-") as temporary:
-        world = team.world(domain)
-        rows = campaign(world, policy, folder or Path(temporary), chosen, _tell)
+        world, rows = team.world(domain), list[Row]()
+
+        def tell(row: Row) -> None:
+            rows.append(row)
+            _tell(row)
+            if json not in (None, options.STDOUT):  # so that what is there stays if the campaign is ended
+                write_json(json, as_json(rows))
+
+        campaign(world, policy, folder or Path(temporary), chosen, tell)
         if full and not case:
-            for row in (fuzz_row(FUZZED), stops_row(STOPS, world, policy)):
-                rows.append(row)
-                _tell(row)
+            tell(fuzz_row(FUZZED))
+            tell(stops_row(STOPS, world, policy))
     typer.echo(table(rows), err=json == options.STDOUT)
-    if json is not None:
+    if json == options.STDOUT:
         write_json(json, as_json(rows))
     if exit_code(rows):
         raise typer.Exit(exit_code(rows))

@@ -1,9 +1,9 @@
-"""`marl-sched world`, `agent`, `deploy`, `certs` and `replay`: a plant and its agents as processes."""
+"""`marl-sched world`, `agent`, `deploy`, `watch`, `certs` and `replay`: a plant and its agents as processes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,6 +15,8 @@ from marl_sched.cli.grouped import DOMAIN_OPTIONS, OwnOptions, takes
 from marl_sched.errors import InvalidOptionError
 
 if TYPE_CHECKING:
+    from marl_sched.comms.dashboard.watcher import Watcher
+    from marl_sched.comms.launcher import Deployment
     from marl_sched.comms.metrics.report import AgentReport, RunReport
     from marl_sched.comms.options import WorldOptions
     from marl_sched.problem import Problem
@@ -27,6 +29,12 @@ Json = options.JsonFile
 Certs = Annotated[
     Path | None,
     typer.Option("--certs", metavar="DIR", help="Certificates, as `marl-sched certs` makes them, for a tls/ endpoint."),
+]
+Web = Annotated[
+    int | None,
+    typer.Option(
+        "--web", metavar="PORT", min=0, max=65535, help="Show the run on a page of this machine; 0: a free port."
+    ),
 ]
 Log = Annotated[
     Path | None,
@@ -44,6 +52,7 @@ def add_to(app: typer.Typer) -> None:
     app.command(epilog="Example: marl-sched certs --out certs --agents crew_0..crew_6 --host plant")(certs)
     example = f"Example: marl-sched deploy {_PROBLEM} --policy random --agent-policy crew_3=condition --json run.json"
     app.command(epilog=example, context_settings=DOMAIN_OPTIONS)(takes(Plant)(deploy))
+    app.command(epilog="Example: marl-sched watch --connect tls/127.0.0.1:7447 --certs certs --web 8080")(watch)
     app.command(epilog="Example: marl-sched replay out/run/run.jsonl --picture run.png")(replay)
 
 
@@ -211,6 +220,8 @@ def deploy(
     restarts: Annotated[
         int, typer.Option("--restarts", help="How often in a row a process that died is started again.")
     ] = 5,
+    live: Annotated[bool, typer.Option("--live", help="Show the agents in the terminal while they run.")] = False,
+    web: Web = None,
     json: Json = None,
 ) -> None:
     """Start the plant and one process for each agent, watch over them, and report what they did."""
@@ -230,9 +241,70 @@ def deploy(
     )
     for name in dict.fromkeys([policy, *by_agent.values()]):
         options.tell_of_training(name, card_of(name, problem.domain), problem.view, problem.objective)
-    with progress_bar() as tell:
-        report = launch(chosen, _warning_of_insecurity(chosen.world, tell))
+    with progress_bar(hidden=live) as tell:
+        report = launch(
+            chosen, _warning_of_insecurity(chosen.world, tell), lambda deployment: _shown(deployment, live, web)
+        )
     finish(report)
+
+
+def watch(
+    run: Annotated[str, typer.Option("--run", help="The world's run.")] = "run",
+    connect: Annotated[
+        str, typer.Option("--connect", metavar="ENDPOINT", help="Where the world listens (default: 127.0.0.1:7447).")
+    ] = "",
+    certs: Certs = None,
+    web: Web = None,
+) -> None:
+    """Look at a running deployment, in this terminal or in a browser, without touching it."""
+    from marl_sched.comms.dashboard.terminal import follow
+
+    with (
+        _watching(run, connect or _endpoint(certs is not None, 7447), str(certs or "")) as watcher,
+        _page(watcher, web),
+    ):
+        try:
+            follow(watcher)
+        except KeyboardInterrupt:
+            typer.echo("no longer looking; the run goes on", err=True)
+
+
+@contextmanager
+def _shown(deployment: Deployment, live: bool, web: int | None) -> Iterator[None]:
+    """Show a deployment while it runs, in the terminal or on a page or not at all."""
+    if not live and web is None:
+        yield
+        return
+    from marl_sched.comms.dashboard.terminal import following
+
+    with ExitStack() as stack:
+        given = deployment.options.world
+        watcher = stack.enter_context(_watching(given.run, deployment.endpoint, deployment.certs))
+        stack.enter_context(_page(watcher, web))
+        if live:
+            stack.enter_context(following(watcher))
+        yield
+
+
+def _watching(run: str, endpoint: str, certs: str) -> Watcher:
+    from marl_sched.comms.dashboard.watcher import Watcher
+    from marl_sched.comms.security.identity import OBSERVER, Identity
+    from marl_sched.comms.transport.zenoh_session import spoke
+
+    identity = Identity(Path(certs), OBSERVER) if certs else None
+    return Watcher(lambda: spoke(run, endpoint, 1.0, identity=identity))
+
+
+@contextmanager
+def _page(watcher: Watcher, port: int | None) -> Iterator[None]:
+    if port is None:
+        yield
+        return
+    from marl_sched.comms.dashboard.web import serving
+
+    with serving(watcher, port) as server:
+        typer.echo(f"the run is shown at {server.address}", err=True)
+        yield
 
 
 def replay(
@@ -293,13 +365,13 @@ def _warning_of_insecurity(world: WorldOptions, tell: Progress) -> Progress:
 
 
 @contextmanager
-def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
+def progress_bar(hidden: bool = False) -> Iterator[Callable[[str, int, int], None]]:
     """A bar on stderr, where there is a terminal, that follows (phase, simulated time, horizon)."""
     from rich.console import Console
     from rich.progress import Progress
 
     console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+    with Progress(console=console, transient=True, disable=hidden or not console.is_terminal) as progress:
         task = progress.add_task("starting", total=None)
 
         def tell(phase: str, tick: int, horizon: int) -> None:
