@@ -59,7 +59,7 @@ def test_quantile_of_nothing_is_none():
 def test_events_of_a_report_are_bounded():
     metrics = RunMetrics()
     for _ in range(MAX_EVENTS + 5):
-        metrics.note_event("hour", 0, "crew_0", "joined")
+        metrics.note_event(0, "crew_0", "joined")
     assert len(metrics.events) == MAX_EVENTS
     assert metrics.counts["events_not_kept"] == 5
 

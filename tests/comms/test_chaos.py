@@ -121,10 +121,10 @@ def test_audit_sees_two_owners_and_another_outcome(played, tmp_path):
 
 def test_case_in_which_nothing_occurred_or_an_attack_changed_something_has_failed():
     case = Case(name="x", fault=lambda scene: None, needs=("loss",), attack=True)
-    report = {
-        "ending": {"exit_code": 143, "reason": None}, "restarts": {"world": 1}, "decisions": [], "deaths": [],
-        "agents": [{"name": "crew_0", "counts": {"unparsed": 2, "heard": 9}}],
-    }  # fmt: skip
+    report = SimpleNamespace(
+        ending=SimpleNamespace(exit_code=143, reason=None), restarts={"world": 1}, decisions=[], deaths=[],
+        agents=[SimpleNamespace(name="crew_0", counts={"unparsed": 2, "heard": 9})],
+    )  # fmt: skip
     row = Row(case="x", secure=True, heard_s=2.5, pause_s=1.5)
     found = _judged(case, row, report, SimpleNamespace(faults=Counter()), [("crew_0", 1)])
     expected = (

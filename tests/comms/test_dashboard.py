@@ -20,6 +20,7 @@ from marl_sched.comms.inproc import Bus, Threads
 from marl_sched.comms.options import WorldOptions
 from marl_sched.comms.protocol import keys
 from marl_sched.comms.protocol import messages as wire
+from marl_sched.problem import Problem
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
@@ -151,7 +152,8 @@ def test_pages_that_follow_are_bounded(served):
 
 def test_world_tells_observers_every_decision_once(make_bus):
     bus = make_bus()
-    world = WorldOptions(env="airme", seed=0, horizon=24, view="local", heartbeat=0.02)
+    problem = Problem("airme", scale="small", count=1, seed=0, episodes=1, horizon=24, view="local")
+    world = WorldOptions(problem=problem, heartbeat=0.02)
     run, state = Threads(world, ["condition"] * 7, bus), RunState()
     said: list[bytes] = []
     bus.deliver = lambda key, payload: said.append(payload) or 1 if key == keys.OBSERVED else 1
@@ -159,11 +161,9 @@ def test_world_tells_observers_every_decision_once(make_bus):
     for payload in said:
         state.hear(payload, 0.0)
     decided = sorted((tick, agent, action) for agent, lane in enumerate(state.lanes) for tick, action, _ in lane)
-    assert decided == sorted(
-        (d["hour"], int(d["agent"].removeprefix("crew_")), d["action"]) for d in report["decisions"]
-    )
+    assert decided == sorted((d.time, int(d.agent.removeprefix("crew_")), d.action) for d in report.decisions)
     assert state.as_dict(0.0)["phase"] == "over"
-    assert state.as_dict(0.0)["objectives"]["profit"] == report["M1"]
+    assert state.as_dict(0.0)["objectives"]["profit"] == report.M1
 
 
 @pytest.mark.slow
