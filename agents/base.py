@@ -101,11 +101,7 @@ class ObservationScheduler(Scheduler):
         """
         if uniform is None and self.samples:
             raise InvalidOptionError(f"{self.name} samples: act(observation, uniform): expected a number in [0, 1)")
-        flat: dict[str, np.ndarray] = dict(observation.get("observation", observation))
-        if ACTION_MASK not in flat:
-            flat[ACTION_MASK] = observation[ACTION_MASK]
-        batched = {name: np.asarray(value)[None] for name, value in flat.items()}
-        return int(self.choose(batched, np.array([uniform or 0.0]))[0])
+        return int(self.choose(batched(observation), np.array([uniform or 0.0]))[0])
 
 
 class AdvantageScheduler(ObservationScheduler):
@@ -129,6 +125,14 @@ class CostScheduler(Scheduler):
         `legal` int8 (B, n_actions) are the acting agents' action masks under the simulator's view. Rows that are
         over hold anything.
         """
+
+
+def batched(observation: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """One agent's observation, flat or as PettingZoo gives it, as arrays with B = 1."""
+    flat: dict[str, np.ndarray] = dict(observation.get("observation", observation))
+    if ACTION_MASK not in flat:
+        flat[ACTION_MASK] = observation[ACTION_MASK]
+    return {name: np.asarray(value)[None] for name, value in flat.items()}
 
 
 def best_action(score: np.ndarray, eligible: np.ndarray) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 An agent's memory is a row of float32 numbers. It is `initial_memory` at the start of an episode, goes into every one of
 the agent's decisions and comes out of it changed, and no other agent reads it. In a simulator the scheduler keeps the
-memories of all agents; an agent that runs by itself keeps its own (`RememberingAgent`), and begins with the initial one
+memories of all agents; an agent that runs by itself keeps its own (`LocalAgent`), and begins with the initial one
 when it is started again.
 """
 
@@ -13,9 +13,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from marl_sched.agents.base import Scheduler
+from marl_sched.agents.base import ObservationScheduler, Scheduler, batched
 from marl_sched.errors import InvalidOptionError
-from marl_sched.graph import ACTION_MASK
 from marl_sched.simulation import TurnSimulator
 
 Observation = Mapping[str, np.ndarray]
@@ -55,7 +54,7 @@ class RecurrentScheduler(Scheduler):
     def decide(self, simulator: TurnSimulator) -> np.ndarray:
         """Observe for every acting agent under the simulator's view, choose, and keep what it remembers."""
         if self._memories is None:
-            raise InvalidOptionError(f"{self.name}: expected start(simulator, rows) before the first decision")
+            raise InvalidOptionError(f"{self.name}: expected start(simulator, envs) before the first decision")
         rows, observation = simulator.observe_acting()
         actions = np.zeros(simulator.batch, np.int64)
         if len(rows):
@@ -66,26 +65,42 @@ class RecurrentScheduler(Scheduler):
         return actions
 
 
-class RememberingAgent:
-    """One agent that decides by itself, with its own memory; equal, bit for bit, to that agent in a simulator.
+class LocalAgent:
+    """One agent that decides by itself; equal, bit for bit, to that agent in a simulator of one environment.
 
     Args:
-        scheduler: what it decides by.
+        scheduler: what it decides by, with a memory or without.
+
+    Attributes:
+        memory: float32 (1, memory_size); None without one.
+        remembered: how many decisions the memory holds; None without one.
     """
 
-    def __init__(self, scheduler: RecurrentScheduler) -> None:
+    def __init__(self, scheduler: ObservationScheduler | RecurrentScheduler) -> None:
         self._scheduler = scheduler
+        self.memory: np.ndarray | None = None
+        self.remembered: int | None = None
         self.reset()
 
     def reset(self) -> None:
         """Forget everything, as at the start of an episode."""
-        self.memory = self._scheduler.initial_memory(1)
+        if isinstance(self._scheduler, RecurrentScheduler):
+            self.memory, self.remembered = self._scheduler.initial_memory(1), 0
+
+    def choose(self, observation: Observation, uniform: float = 0.0) -> int:
+        """The agent's choice from its observation with B = 1, and a uniform in [0, 1) for one that samples."""
+        noise = np.array([uniform])
+        if isinstance(self._scheduler, ObservationScheduler):
+            return int(self._scheduler.choose(observation, noise)[0])
+        actions, self.memory = self._scheduler.choose_recurrent(observation, self._remembering(), noise)
+        self.remembered = (self.remembered or 0) + 1
+        return int(actions[0])
 
     def act(self, observation: Observation, uniform: float = 0.0) -> int:
         """The agent's choice from its own observation without batch axis, as PettingZoo gives it."""
-        flat: dict[str, np.ndarray] = dict(observation.get("observation", observation))
-        if ACTION_MASK not in flat:
-            flat[ACTION_MASK] = observation[ACTION_MASK]
-        batched = {name: np.asarray(value)[None] for name, value in flat.items()}
-        actions, self.memory = self._scheduler.choose_recurrent(batched, self.memory, np.array([uniform]))
-        return int(actions[0])
+        return self.choose(batched(observation), uniform)
+
+    def _remembering(self) -> np.ndarray:
+        if self.memory is None:
+            raise RuntimeError("an agent of a RecurrentScheduler has a memory")
+        return self.memory

@@ -20,7 +20,7 @@ from marl_sched.errors import InvalidFileError, InvalidOptionError, MarlSchedErr
 from marl_sched.plugins import SCHEDULERS, import_object, is_object_name, load_offered, offered
 
 if TYPE_CHECKING:
-    from marl_sched.agents.policies.network_policy import NetworkPolicy
+    from marl_sched.agents.policies.network_policy import NetworkPolicy, RecurrentPolicy
     from marl_sched.graph import GraphSpec
 
 SHIPPED = Path(__file__).resolve().parent / "policies" / "shipped"
@@ -105,23 +105,25 @@ def _create_named(where: str, options: Mapping[str, Any]) -> Scheduler:
     return made
 
 
-def load_policy(name_or_path: str | Path, *, mode: Mode | None = None, graph: GraphSpec | None = None) -> NetworkPolicy:
+def load_policy(
+    name_or_path: str | Path, *, mode: Mode | None = None, graph: GraphSpec | None = None
+) -> NetworkPolicy | RecurrentPolicy:
     """A trained policy by its shipped name, or by the path of its weights or its card.
 
-    `mode` is `greedy` or `sample`, None: as its card says. With a `graph` a policy that was trained on another
-    metagraph is refused. Raises UnknownNameError for a name that does not ship, InvalidFileError for damaged
-    files, MarlSchedError without PyTorch.
+    `mode` is `greedy` or `sample`, None: as its card says. One whose network has a memory is a RecurrentPolicy. With a
+    `graph` a policy that was trained on another metagraph is refused. Raises UnknownNameError for a name that does not
+    ship, InvalidFileError for damaged files, MarlSchedError without PyTorch.
     """
     path = policy_path(name_or_path)
     try:
-        from marl_sched.agents.policies.network_policy import NetworkPolicy
+        from marl_sched.agents.policies.network_policy import TrainedPolicy
     except ModuleNotFoundError as error:
         if error.name not in ("torch", "safetensors"):
             raise
         raise MarlSchedError(
             f"policy {name_or_path}: expected {error.name} to be installed: pip install 'marl-sched[policies]'"
         ) from error
-    return NetworkPolicy.load(path, mode=mode, graph=graph)
+    return TrainedPolicy.load(path, mode=mode, graph=graph)
 
 
 def card_of(name_or_path: str | Path, domain: Domain | str) -> PolicyCard | None:

@@ -14,9 +14,8 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import numpy as np
-
 from marl_sched.agents.base import ObservationScheduler
+from marl_sched.agents.recurrent import LocalAgent, RecurrentScheduler
 from marl_sched.agents.registry import create_scheduler
 from marl_sched.comms.metrics.throttle import ThrottledLog
 from marl_sched.comms.options import AgentOptions
@@ -39,7 +38,8 @@ class PolicyMind:
     def __init__(self, options: AgentOptions) -> None:
         self._options = options
         self._state: LocalState | None = None
-        self._scheduler: ObservationScheduler | None = None
+        self._scheduler: ObservationScheduler | RecurrentScheduler | None = None
+        self._agent: LocalAgent | None = None
 
     def meet(self, frame: wire.Frame) -> tuple[str, Sequence[str]]:
         """See Mind.meet. Raises InvalidOptionError for an agent that does not exist or a policy that cannot decide."""
@@ -57,21 +57,34 @@ class PolicyMind:
             raise DeploymentError(f"the world's frame cannot be read: {error}") from error
         if self._scheduler is None:
             self._scheduler = load_policy(self._options.policy, domain)
+            self._agent = LocalAgent(self._scheduler)
         return domain.agent_prefix, self._state.channels
 
     def learn(self, channel: str, payload: bytes) -> None:
         """See Mind.learn."""
         self._known()[0].hear(channel, payload)
 
-    def choose(self, noise: float) -> int:
-        """The policy's action."""
-        state, scheduler = self._known()
-        return int(scheduler.choose(state.observe(), np.array([noise]))[0])
+    def forget(self) -> bool:
+        """See Mind.forget."""
+        agent = self._known()[1]
+        agent.reset()
+        return agent.memory is not None
 
-    def _known(self) -> tuple[LocalState, ObservationScheduler]:
-        if self._state is None or self._scheduler is None:
+    def choose(self, noise: float) -> tuple[int, int | None]:
+        """The policy's action, and how many decisions its memory held before it; None without a memory."""
+        state, agent = self._known()
+        remembered = agent.remembered
+        return agent.choose(state.observe(), noise), remembered
+
+    def rehearse(self) -> None:
+        """Decide once and forget it: the first decision of a policy is slow."""
+        if self._scheduler is not None:
+            LocalAgent(self._scheduler).choose(self._known()[0].observe(), 0.5)
+
+    def _known(self) -> tuple[LocalState, LocalAgent]:
+        if self._state is None or self._agent is None:
             raise RuntimeError("the world has not been met")
-        return self._state, self._scheduler
+        return self._state, self._agent
 
 
 class Agent:
@@ -125,9 +138,9 @@ class Agent:
                 case ev.Ask(question, key, asked):
                     self.transport.ask(question, key, b"" if asked is None else wire.encode(asked))
                 case ev.Choose(turn):
-                    self.handle(ev.Chosen(turn.sequence, self.mind.choose(turn.noise)))
+                    self.handle(ev.Chosen(turn.sequence, *self.mind.choose(turn.noise)))
                 case ev.Announce(key):
-                    self.mind.choose(0.5)  # the first decision of a policy is slow: before the world counts on it
+                    self.mind.rehearse()  # before the world counts on it
                     self.transport.announce(key)
                 case ev.Reopen():
                     self.transport.reopen()
@@ -144,10 +157,10 @@ class Agent:
                     self._warnings.warn(kind, text, self._clock())
 
 
-def load_policy(policy: str, domain: Any) -> ObservationScheduler:
-    """A policy that decides on one agent's observation; InvalidOptionError for one that needs more."""
+def load_policy(policy: str, domain: Any) -> ObservationScheduler | RecurrentScheduler:
+    """A policy that decides on one agent's observation and memory; InvalidOptionError for one that needs more."""
     scheduler = create_scheduler(policy, domain)
-    if not isinstance(scheduler, ObservationScheduler):
+    if not isinstance(scheduler, ObservationScheduler | RecurrentScheduler):
         raise InvalidOptionError(f"{policy} needs more than an agent's own observation and cannot be deployed")
     return scheduler
 

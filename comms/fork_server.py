@@ -147,6 +147,7 @@ def warm_up(world: Any, policies: list[str]) -> None:
     """Import, load from disk and compile what the processes are about to use."""
     import numpy as np
 
+    from marl_sched.agents.recurrent import LocalAgent
     from marl_sched.comms.agent import load_policy
     from marl_sched.comms.plant import SimulatedPlant
 
@@ -157,7 +158,7 @@ def warm_up(world: Any, policies: list[str]) -> None:
         if channel in local.channels:
             local.hear(channel, payload)
     for policy in policies:
-        load_policy(policy, plant.domain).choose(local.observe(), np.array([0.5]))
+        LocalAgent(load_policy(policy, plant.domain)).choose(local.observe(), 0.5)
     plant.simulator.observe(plant.simulator.acting)
     plant.simulator.step(np.zeros(1, np.int64))
 

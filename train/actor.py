@@ -17,8 +17,10 @@ from torchrl.modules import MaskedCategorical, ProbabilisticActor
 
 from marl_sched.agents.base import inverse_distribution
 from marl_sched.agents.networks.compaction import compacted
-from marl_sched.agents.networks.network import PolicyNetwork
-from marl_sched.graph import ACTION_MASK, TIME, VISIBLE_SHARE
+from marl_sched.agents.networks.network import MEMORY, PolicyNetwork, RecurrentNetwork
+from marl_sched.graph import ACTION_MASK
+from marl_sched.train.environment import REMEMBERED
+from marl_sched.train.sequences import PLACE, logits_of, observed_by
 
 LOG_PROB = "action_log_prob"
 
@@ -46,6 +48,9 @@ class CounterCategorical(MaskedCategorical):
 class Logits(TensorDictModuleBase):
     """A network that reads a tensordict's observation and writes `logits`, differentiably.
 
+    A recurrent network reads decisions in sequences, in the order of `RecurrentNetwork.unroll` (marl_sched.train
+    .sequences), and gradients flow through each sequence.
+
     Args:
         network: the policy's.
     """
@@ -53,27 +58,32 @@ class Logits(TensorDictModuleBase):
     def __init__(self, network: PolicyNetwork) -> None:
         super().__init__()
         self.network = network
-        sizes = {node.name: 1 for node in network.spec.nodes}
-        self.in_keys: list[Any] = [name for name in network.spec.arrays(sizes) if name not in (TIME, VISIBLE_SHARE)]
+        self.in_keys: list[Any] = observed_by(network)
+        if isinstance(network, RecurrentNetwork):
+            self.in_keys.append(PLACE)
         self.out_keys: list[Any] = ["logits"]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write float (N, n_actions); the lowest finite number where an action is not legal."""
-        return tensordict.set("logits", self._logits({name: tensordict.get(name) for name in self.in_keys}))
-
-    def _logits(self, observation: Mapping[str, Tensor]) -> Tensor:
-        return self.network(observation)
+        return tensordict.set("logits", logits_of(self.network, {name: tensordict.get(name) for name in self.in_keys}))
 
 
-class ActingLogits(Logits):
+class ActingLogits(TensorDictModuleBase):
     """The same for acting: without gradients, and without what nobody of a batch sees, where the network allows that.
 
+    With a recurrent network it also writes what the acting agents remember now, `remembered`.
     `prepare` works out once what depends on the parameters alone (PolicyNetwork.weights); it is to be called again
     whenever they have changed, or never, as in a worker whose parameters are changed from outside.
+
+    Args:
+        network: the policy's.
     """
 
     def __init__(self, network: PolicyNetwork) -> None:
-        super().__init__(network)
+        super().__init__()
+        self.network = network
+        self.in_keys: list[Any] = observed_by(network)
+        self.out_keys: list[Any] = ["logits", REMEMBERED] if isinstance(network, RecurrentNetwork) else ["logits"]
         self._weights: Any = None
 
     @torch.inference_mode()
@@ -82,16 +92,28 @@ class ActingLogits(Logits):
         self._weights = self.network.weights()
 
     @torch.inference_mode()
-    def _logits(self, observation: Mapping[str, Tensor]) -> Tensor:
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write float (N, n_actions); the lowest finite number where an action is not legal."""
+        observation = {name: tensordict.get(name) for name in self.in_keys}
+        for name, written in zip(self.out_keys, self._found(observation), strict=True):
+            tensordict.set(name, written)
+        return tensordict
+
+    def _found(self, observation: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
         if not self.network.permutation_equivariant:
-            return self.network(observation, self._weights)
+            return self._pass(observation)
         visible, names = compacted(self.network.spec, observation)
-        found = self.network(visible, self._weights)
+        found, *others = self._pass(visible)
         logits = found.new_full(observation[ACTION_MASK].shape, torch.finfo(found.dtype).min)
-        return logits.scatter_(1, names, found)
+        return logits.scatter_(1, names, found), *others
+
+    def _pass(self, observation: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
+        if isinstance(self.network, RecurrentNetwork):
+            return self.network.recur(observation, observation[MEMORY])
+        return (self.network(observation, self._weights),)
 
 
-def actor(module: Logits) -> ProbabilisticActor:
+def actor(module: Logits | ActingLogits) -> ProbabilisticActor:
     """The actor that samples from a network's logits."""
     return ProbabilisticActor(
         module=module,

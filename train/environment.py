@@ -5,7 +5,8 @@ Beside what `SchedulingTorchRL` gives, the tensordict holds
     progress     (B,)            int64    how far the episode has come, in the domain's unit
     central      nested          the observation's arrays under the full view, for a critic or a teacher; optional
     costs        (B, n_actions)  float64  what a teacher says that each choice costs (agents.base); optional
-    memory       (B, M, size)    float32  what a recurrent policy carries (marl_sched.agents.base); optional
+    memory       (B, size)       float32  what the acting agent remembers, for a recurrent policy; optional
+    remembered   (B, size)       float32  what it remembers after its decision, written by the policy with the action
 
 An episode is cut (`truncated`) when its length has passed, which the curriculum gives at the row's reset. Everything
 random is named by numbers (which episode of the run a row plays, counter-based noise), so that what a row plays depends
@@ -24,6 +25,7 @@ from tensordict import TensorDictBase
 from torchrl.data import Composite, Unbounded
 
 from marl_sched.agents.base import CostScheduler
+from marl_sched.agents.networks.network import MEMORY
 from marl_sched.agents.registry import create_scheduler
 from marl_sched.domain import Domain
 from marl_sched.envs.api.torchrl_env import SchedulingTorchRL
@@ -33,7 +35,7 @@ from marl_sched.problem import Problem
 from marl_sched.simulation import SavedState
 from marl_sched.train.curriculum import EpisodeLength
 
-CENTRAL, COSTS, MEMORY = "central", "costs", "memory"
+CENTRAL, COSTS, REMEMBERED = "central", "costs", "remembered"
 
 
 class InstanceSource:
@@ -68,7 +70,7 @@ class TrainingTask:
             is in every update.
         central: give the full view beside the agents' own.
         teacher: name of a CostScheduler that is asked in every turn; "": nobody is.
-        memory: (M, size) of a recurrent policy's memory, see marl_sched.agents.base.
+        memory: numbers that an agent carries from decision to decision (PolicyNetwork's `memory_size`), 0: none.
         skip: episodes of each row that are left out, as those that a run had begun before it was stopped.
     """
 
@@ -80,7 +82,7 @@ class TrainingTask:
     turns: int | None = None
     central: bool = False
     teacher: str = ""
-    memory: tuple[int, int] = (0, 0)
+    memory: int = 0
     skip: int = 0
 
     def environment(self, first: int = 0, rows: int | None = None) -> TrainingEnv:
@@ -103,7 +105,7 @@ class TrainingEnv(SchedulingTorchRL):
         self.episode_length = task.length(0)
         self._steps, self._resumes = 0, False  # steps of every row; whether the next reset begins nothing
         self._cut = np.zeros(rows, np.int64)  # where each row's episode is cut, in the domain's unit
-        self._memory = torch.zeros(rows, *task.memory)
+        self._memory = torch.zeros(rows, 0, task.memory)  # (B, max_agents, size), empty at the start of an episode
         self._teacher = cost_teacher(task.teacher, problem.domain) if task.teacher else None
         source = InstanceSource(problem, task.scales, rows=task.rows, episodes=task.episodes)
         super().__init__(
@@ -131,8 +133,9 @@ class TrainingEnv(SchedulingTorchRL):
         if self._teacher is not None:
             shape = (*batch, self.simulator.max_actions)
             self.observation_spec[COSTS] = Unbounded(shape, dtype=torch.float64)
-        if self.task.memory[1]:
-            self.observation_spec[MEMORY] = Unbounded((*batch, *self.task.memory), dtype=torch.float32)
+        self._memory = torch.zeros(*batch, self.simulator.max_agents, self.task.memory)
+        if self.task.memory:
+            self.observation_spec[MEMORY] = Unbounded((*batch, self.task.memory), dtype=torch.float32)
 
     def _set_seed(self, seed: int | None) -> None:
         super()._set_seed(seed)
@@ -182,9 +185,11 @@ class TrainingEnv(SchedulingTorchRL):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._steps += 1
-        carried = tensordict.get(("next", MEMORY), None)
-        if carried is not None:
-            self._memory = carried
+        remembered = tensordict.get(REMEMBERED, None)
+        if remembered is not None:
+            acting = torch.from_numpy(np.flatnonzero(self.simulator.acting >= 0))
+            agents = torch.from_numpy(self.simulator.acting)[acting]
+            self._memory[acting, agents] = remembered.detach().cpu()[acting]
         return super()._step(tensordict)
 
     def _turn_entries(self) -> dict[str, Any]:
@@ -200,8 +205,9 @@ class TrainingEnv(SchedulingTorchRL):
             out[CENTRAL] = {name: torch.from_numpy(array) for name, array in central.items()}
         if self._teacher is not None:
             out[COSTS] = torch.from_numpy(self._teacher.costs(self.simulator, self._mask.astype(np.int8)))
-        if self.task.memory[1]:
-            out[MEMORY] = self._memory
+        if self.task.memory:
+            agents = torch.from_numpy(self.simulator.acting).clamp(min=0)
+            out[MEMORY] = self._memory[torch.arange(len(agents)), agents]
         return out
 
 

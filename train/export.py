@@ -11,7 +11,7 @@ import msgspec
 from marl_sched.agents.networks.network import PolicyNetwork, slots_of
 from marl_sched.agents.policies.cards import PolicyCard
 from marl_sched.agents.policies.checkpoint import load_network, save_network
-from marl_sched.agents.policies.network_policy import NetworkPolicy
+from marl_sched.agents.policies.network_policy import policy_of
 from marl_sched.domain import Domain, get_domain
 from marl_sched.problem import Problem
 from marl_sched.train.config import RunRecord, load_record
@@ -94,7 +94,7 @@ def export_policy(
             horizon=length,
             options=options,
         )
-        policy = NetworkPolicy(network, mode=card.mode, card=card)
+        policy = policy_of(network, mode=card.mode, card=card)
         scores = evaluate_scheduler(problem, policy)
         means = scores.measures[card.objective].mean(axis=1)
         measured[scale] = {

@@ -61,7 +61,8 @@ class PolicyGradient:
                 f"algorithm.turns: expected a segment in which turns can be told from what follows them, got one of "
                 f"{rollout.turns} turns of which none can"
             )
-        samples = samples_of(self.policy, rollout, estimate, self._ppo.config.min_keep_prob, rng)
+        config = self._ppo.config
+        samples = samples_of(self.policy, rollout, estimate, config.min_keep_prob, rng, config.bptt)
         report = self._ppo.update(samples, progress, rng)
         return {**asdict(report), "explained_variance": estimate.explained_variance}
 

@@ -5,7 +5,7 @@ The loss is asked for its terms per sample, which our weights and masks then red
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torchrl.objectives import ClipPPOLoss
 
 from marl_sched.agents.networks.compaction import compacted
-from marl_sched.agents.networks.network import PolicyNetwork
+from marl_sched.agents.networks.network import PolicyNetwork, RecurrentNetwork
 from marl_sched.errors import InvalidOptionError
 from marl_sched.graph import ACTION_MASK
 from marl_sched.train.actor import LOG_PROB, Logits, actor
@@ -28,6 +28,7 @@ from marl_sched.train.collect import Rollout
 from marl_sched.train.device import device_of
 from marl_sched.train.environment import CENTRAL
 from marl_sched.train.estimators import TIME_LEFT, Estimate, seen_by_critic
+from marl_sched.train.sequences import PLACE, SEQUENCE, minibatches, observed_by, own_sequences
 
 VALUE_WEIGHT = 0.5
 
@@ -37,6 +38,9 @@ class PpoConfig(Group, frozen=True, kw_only=True):
 
     A run that starts from a trained policy must not unlearn it by the errors of a new critic: for the share
     `critic_warmup` of its updates the policy stays as it is, and then learns `policy_rate` times as fast as the critic.
+
+    `bptt` is for recurrent policies (marl_sched.train.sequences): through how many of an agent's own turns gradients
+    flow back at most, None: through all that it has in an update.
     """
 
     clip: Positive
@@ -50,6 +54,7 @@ class PpoConfig(Group, frozen=True, kw_only=True):
     min_keep_prob: Annotated[float, Meta(gt=0, le=1)]
     critic_warmup: Annotated[float, Meta(ge=0, lt=1)]
     policy_rate: Positive
+    bptt: Count | None = None
 
 
 @dataclass(frozen=True)
@@ -69,39 +74,57 @@ class UpdateReport:
 
 
 def importance_subsample(
-    policy: PolicyNetwork, rollout: Rollout, loss_mask: Tensor, min_keep_prob: float, rng: np.random.Generator
+    policy: PolicyNetwork,
+    rollout: Rollout,
+    loss_mask: Tensor,
+    min_keep_prob: float,
+    rng: np.random.Generator,
+    bptt: int | None = None,
 ) -> tuple[TensorDict, Tensor, tuple[Tensor, Tensor]]:
     """Turns of a rollout as a flat TensorDict of compacted graphs, with weights.
 
     Turns outside `loss_mask`, bool (T, B), are left behind here, whatever they hold. Of the others a turn is
     kept with probability q = max(1 - p, min_keep_prob), p being the probability of what was chosen, and weighs 1 / q:
     where a policy is nearly certain (a crew that waits, hour after hour) there is little to learn, and
-    the weights keep every sum's expectation. `min_keep_prob` 1 keeps all.
+    the weights keep every sum's expectation. `min_keep_prob` 1 keeps all. Of a recurrent policy's turns whole
+    sequences are kept, of at most `bptt` turns of an agent, with weight 0 for those outside `loss_mask`
+    (marl_sched.train.sequences).
 
     Raises InvalidOptionError if none is kept.
     Returns the samples, the action that each decision node of theirs stands for, int64 (N, n_kept), and
     the turn and the row of the rollout that each comes from, int64 (N,) each.
     """
-    certainty = torch.where(loss_mask, rollout.log_probs, 0.0).exp()
-    keep = (1 - certainty).clamp(min_keep_prob, 1.0)
-    kept = loss_mask & (torch.from_numpy(rng.random(loss_mask.shape)) < keep)
-    turn, row = kept.nonzero(as_tuple=True)
+    more: dict[str, Tensor] = {}
+    if isinstance(policy, RecurrentNetwork):
+        whose = (rollout.agents, rollout.valid, rollout.boundary)
+        turn, row, more[SEQUENCE], more[PLACE] = own_sequences(*whose, loss_mask, bptt)
+        weight = loss_mask.float()
+    else:
+        certainty = torch.where(loss_mask, rollout.log_probs, 0.0).exp()
+        keep = (1 - certainty).clamp(min_keep_prob, 1.0)
+        kept = loss_mask & (torch.from_numpy(rng.random(loss_mask.shape)) < keep)
+        turn, row = kept.nonzero(as_tuple=True)
+        weight = 1 / keep
     if not len(row):
         raise InvalidOptionError(
             f"train: none of the {int(loss_mask.sum())} turns of an update that count was kept to learn from; expected "
             "more instances, longer segments (algorithm.turns) or a larger share of certain turns (min_keep_prob)"
         )
-    names = Logits(policy).in_keys
-    observation, actions = _as_read(policy, rollout.data.select(*names)[row, turn].to_dict())
-    data = {**observation, "uniform": rollout.data["uniform"][row, turn], "weight": (1 / keep)[turn, row]}
+    observation, actions = _as_read(policy, rollout.data.select(*observed_by(policy))[row, turn].to_dict())
+    data = {**observation, "uniform": rollout.data["uniform"][row, turn], "weight": weight[turn, row], **more}
     return TensorDict(data, batch_size=[len(row)]), actions, (turn, row)
 
 
 def samples_of(
-    policy: PolicyNetwork, rollout: Rollout, estimate: Estimate, min_keep_prob: float, rng: np.random.Generator
+    policy: PolicyNetwork,
+    rollout: Rollout,
+    estimate: Estimate,
+    min_keep_prob: float,
+    rng: np.random.Generator,
+    bptt: int | None = None,
 ) -> TensorDict:
     """Turns to learn from (`importance_subsample`), with what was chosen, normalised advantages and value targets."""
-    samples, names, (turn, row) = importance_subsample(policy, rollout, estimate.loss_mask, min_keep_prob, rng)
+    samples, names, (turn, row) = importance_subsample(policy, rollout, estimate.loss_mask, min_keep_prob, rng, bptt)
     samples["action"] = (names == rollout.actions[turn, row][:, None]).int().argmax(1)
     samples[LOG_PROB] = rollout.log_probs[turn, row]
     advantages = normalised(estimate.advantages, estimate.loss_mask)[turn, row]
@@ -182,10 +205,10 @@ class Ppo:
         for name, group in zip(self.modules, self.optimizer.param_groups, strict=True):
             group["lr"] = rate * (of_policy if name == "policy" else 1.0)
         device = device_of(self.policy)
-        samples = samples.to(device)
+        on_device = samples.to(device)
         reports = [
-            self._step(samples[indices.to(device)])
-            for indices in minibatches(samples.shape[0], config.minibatch, config.epochs, rng)
+            self._step(on_device[indices.to(device)])
+            for indices in minibatches(samples, config.minibatch, config.epochs, rng)
         ]
         return UpdateReport(*means(reports))
 
@@ -211,11 +234,3 @@ def means(reports: Sequence[Tensor]) -> list[float]:
 def between(start: float, end: float, progress: float) -> float:
     """What changes linearly from start to end, at `progress` in [0, 1]."""
     return start + (end - start) * progress
-
-
-def minibatches(count: int, size: int, epochs: int, rng: np.random.Generator) -> Iterator[Tensor]:
-    """Index tensors of at most about `size` samples each; every epoch visits every sample once."""
-    parts = max(1, round(count / size))
-    for _ in range(epochs):
-        order = torch.from_numpy(rng.permutation(count))
-        yield from order.tensor_split(parts)

@@ -9,7 +9,7 @@ import numpy as np
 
 from marl_sched.agents.base import Scheduler
 from marl_sched.agents.networks.network import PolicyNetwork
-from marl_sched.agents.policies.network_policy import NetworkPolicy
+from marl_sched.agents.policies.network_policy import policy_of
 from marl_sched.agents.registry import create_scheduler
 from marl_sched.domain import Domain, get_domain
 from marl_sched.errors import InvalidOptionError
@@ -52,7 +52,7 @@ class Validation:
 
     def __call__(self, network: PolicyNetwork) -> dict[str, float]:
         """M1 on every scale, the mean over its instances and episodes."""
-        return self._means(NetworkPolicy(network, mode=self._mode, domain=self._domain.name))
+        return self._means(policy_of(network, mode=self._mode, domain=self._domain.name))
 
     def score(self, means: Mapping[str, float]) -> float:
         """What policies are compared by: the mean over scales of M1, of its ratio to the baseline's if there is one.

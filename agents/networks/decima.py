@@ -13,17 +13,16 @@ neither do agents (crews), which the bipartite graph does not contain.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import cast
 
 from msgspec import Struct
-from torch import Tensor, nn
-from torch.nn import functional
+from torch import Tensor
 
 from marl_sched.agents.networks.network import (
     PolicyNetwork,
     explore_at_first,
     fully_connected,
     mask_logits,
+    scores_beside,
     visible_features,
 )
 from marl_sched.agents.networks.registry import NAME, NetworkConfig
@@ -71,13 +70,4 @@ class DecimaNetwork(PolicyNetwork):
         embedded = self.f(features)
         hidden = observation[f"{task}_mask"] == 0
         state = self.g(embedded.masked_fill(hidden[..., None], 0.0).sum(1, keepdim=True))
-        return mask_logits(self._scores(embedded, state).squeeze(-1), observation)
-
-    def _scores(self, embedded: Tensor, state: Tensor) -> Tensor:
-        """The scores q (B, n, 1) of embeddings (B, n, hidden), each beside its graph's state (B, 1, hidden).
-
-        The first layer's product with the state is the same for all tasks of a graph, and is made once.
-        """
-        first, rest = cast(nn.Linear, self.q[0]), self.q[1:]
-        of_task, of_state = first.weight.split(embedded.shape[-1], dim=1)
-        return rest(functional.linear(embedded, of_task, first.bias) + functional.linear(state, of_state))
+        return mask_logits(scores_beside(self.q, embedded, state), observation)

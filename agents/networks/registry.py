@@ -39,6 +39,11 @@ class NetworkConfig:
         """The name under which the network is registered."""
         return str(cls.__struct_config__.tag)
 
+    @property
+    def memory_size(self) -> int:
+        """Numbers that an agent carries from one of its decisions to the next; most networks carry none."""
+        return 0
+
     def build(self, graph: GraphSpec) -> PolicyNetwork:
         """An untrained network for a metagraph; torch's generator draws its weights."""
         raise NotImplementedError(type(self).__name__)

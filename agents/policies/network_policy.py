@@ -6,17 +6,18 @@ import copy
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple, get_args
+from typing import NamedTuple, TypedDict, Unpack, cast, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from marl_sched.agents.base import ObservationScheduler, inverse_distribution
-from marl_sched.agents.networks.batches import logits_in_blocks
-from marl_sched.agents.networks.network import PolicyNetwork
+from marl_sched.agents.base import ObservationScheduler, Scheduler, inverse_distribution
+from marl_sched.agents.networks.batches import logits_in_blocks, recurred_in_blocks
+from marl_sched.agents.networks.network import PolicyNetwork, RecurrentNetwork
 from marl_sched.agents.policies.cards import Mode, PolicyCard, check_graph
 from marl_sched.agents.policies.checkpoint import load_network
+from marl_sched.agents.recurrent import RecurrentScheduler
 from marl_sched.domain import domain_names, get_domain
 from marl_sched.errors import InvalidOptionError
 from marl_sched.graph import ACTION_MASK, STATE, TIME, VISIBLE_SHARE, GraphSpec
@@ -26,6 +27,15 @@ Observation = Mapping[str, np.ndarray]
 _NEVER = -1  # before every simulated time
 
 
+class PolicyOptions(TypedDict, total=False):
+    """Options of a policy that is made from a network; see TrainedPolicy."""
+
+    name: str
+    mode: Mode
+    card: PolicyCard | None
+    domain: str | None
+
+
 class _FirstLogits(NamedTuple):
     """Of every row of a batch, the simulated time, int64 (B,), of the decision epoch whose first logits are kept."""
 
@@ -33,8 +43,8 @@ class _FirstLogits(NamedTuple):
     logits: np.ndarray  # float32 (B, n_actions)
 
 
-class NetworkPolicy(ObservationScheduler):
-    """Decides by a copy of a network, whatever its architecture.
+class TrainedPolicy(Scheduler):
+    """A copy of a network that decides, whatever its architecture; `policy_of` makes the one that a network needs.
 
     At batch size 1 a choice is a function of the observation's bits, the padding included; in a larger batch
     logits agree within 1e-5, as the network then sees it in blocks without what nobody sees
@@ -50,6 +60,8 @@ class NetworkPolicy(ObservationScheduler):
             trained with one decision an hour (scheme Single, section 6.3.1). On a lone observation it samples.
         card: what the weights are, if they come from a file.
         domain: the domain's name, whose pressing actions count; None: the card's. Without either none is pressing.
+
+    Raises InvalidOptionError for another mode.
     """
 
     def __init__(
@@ -77,7 +89,6 @@ class NetworkPolicy(ObservationScheduler):
         self._n_features = {node.name: len(node.features) for node in self.graph.nodes}
         self._n_features[STATE] = len(self.graph.state_features)
         self._checked: GraphSpec | None = None
-        self._first = _FirstLogits(np.zeros(0, np.int64), np.zeros((0, 0), np.float32))
 
     @cached_property
     def _pressing(self) -> Callable[[GraphSpec, Observation], np.ndarray] | None:
@@ -86,8 +97,10 @@ class NetworkPolicy(ObservationScheduler):
             return None
         return get_domain(self._domain).pressing
 
-    @classmethod
-    def load(cls, path: str | Path, *, mode: Mode | None = None, graph: GraphSpec | None = None) -> NetworkPolicy:
+    @staticmethod
+    def load(
+        path: str | Path, *, mode: Mode | None = None, graph: GraphSpec | None = None
+    ) -> NetworkPolicy | RecurrentPolicy:
         """A policy from its files (marl_sched.agents.policies.checkpoint); its name is the file's.
 
         `mode` None is its card's. Raises InvalidFileError for damaged files, or if the policy was trained on
@@ -96,7 +109,43 @@ class NetworkPolicy(ObservationScheduler):
         network, card = load_network(path)
         if graph is not None:
             check_graph(Path(path).with_suffix(".json"), card, graph)
-        return cls(network, name=Path(path).stem, mode=card.mode if mode is None else mode, card=card)
+        return policy_of(network, name=Path(path).stem, mode=card.mode if mode is None else mode, card=card)
+
+    def _check(self, simulator: TurnSimulator) -> None:
+        """Raise InvalidFileError if the policy was trained on another metagraph than the simulator's."""
+        if simulator.graph is not self._checked:
+            if self.card is not None:
+                check_graph(f"{self.name}.json", self.card, simulator.graph)
+            self._checked = simulator.graph
+
+    def _pick(self, logits: np.ndarray, uniform: np.ndarray, observation: Observation) -> np.ndarray:
+        if self.samples:
+            return inverse_distribution(logits, uniform)
+        actions = logits.argmax(1)
+        if self._pressing is None or actions.all():
+            return actions
+        urgent = np.where(self._pressing(self.graph, observation), logits, -np.inf)
+        return np.where((actions == 0) & (urgent.max(1) > -np.inf), urgent.argmax(1), actions)
+
+    def _tensors(self, observation: Observation) -> dict[str, Tensor]:
+        """The arrays that the network reads; InvalidOptionError where they are not those that it was trained on."""
+        for name, n_features in self._n_features.items():
+            shape = np.shape(observation[name]) if name in observation else ()
+            if not shape or shape[-1] != n_features:
+                raise InvalidOptionError(
+                    f"observation: {name}: policy {self.name} expects {n_features} features, got shape {shape}"
+                )
+        return {name: _tensor(observation[name]) for name in self._arrays}
+
+
+class NetworkPolicy(TrainedPolicy, ObservationScheduler):
+    """Decides by a network that carries no memory; see TrainedPolicy."""
+
+    def __init__(self, network: PolicyNetwork, **options: Unpack[PolicyOptions]) -> None:
+        if isinstance(network, RecurrentNetwork):
+            raise InvalidOptionError(f"policy {options.get('name', '')}: expected RecurrentPolicy for its network")
+        super().__init__(network, **options)
+        self._first = _FirstLogits(np.zeros(0, np.int64), np.zeros((0, 0), np.float32))
 
     def start(self, simulator: TurnSimulator, envs: np.ndarray) -> None:
         """Forget what was seen in earlier episodes of these rows."""
@@ -109,10 +158,7 @@ class NetworkPolicy(ObservationScheduler):
         Raises InvalidFileError if the policy was trained on another metagraph than the simulator's, InvalidOptionError
         for the mode one_pass under a view that hides something.
         """
-        if simulator.graph is not self._checked:
-            if self.card is not None:
-                check_graph(f"{self.name}.json", self.card, simulator.graph)
-            self._checked = simulator.graph
+        self._check(simulator)
         rows, observation = simulator.observe_acting()
         actions = np.zeros(simulator.batch, np.int64)
         if len(rows):
@@ -143,31 +189,61 @@ class NetworkPolicy(ObservationScheduler):
         """Actions int64 (B,) from batched observations and uniforms float64 (B,) in [0, 1)."""
         return self._pick(self.logits(observation), uniform, observation)
 
-    def _pick(self, logits: np.ndarray, uniform: np.ndarray, observation: Observation) -> np.ndarray:
-        if self.samples:
-            return inverse_distribution(logits, uniform)
-        actions = logits.argmax(1)
-        if self._pressing is None or actions.all():
-            return actions
-        urgent = np.where(self._pressing(self.graph, observation), logits, -np.inf)
-        return np.where((actions == 0) & (urgent.max(1) > -np.inf), urgent.argmax(1), actions)
-
     @torch.inference_mode()
     def logits(self, observation: Observation) -> np.ndarray:
         """Logits float32 (B, n_actions) of batched observations; the lowest finite number where illegal.
 
         Raises InvalidOptionError for an observation without the arrays or the features that it was trained on.
         """
-        for name, n_features in self._n_features.items():
-            shape = np.shape(observation[name]) if name in observation else ()
-            if not shape or shape[-1] != n_features:
-                raise InvalidOptionError(
-                    f"observation: {name}: policy {self.name} expects {n_features} features, got shape {shape}"
-                )
-        tensors = {name: _tensor(observation[name]) for name in self._arrays}
+        tensors = self._tensors(observation)
         if len(tensors[ACTION_MASK]) == 1:
             return self._network(tensors, self._weights).numpy()
         return logits_in_blocks(self._network, tensors, self._weights).numpy()
+
+
+class RecurrentPolicy(TrainedPolicy, RecurrentScheduler):
+    """Decides by a network with which every agent carries a memory; see TrainedPolicy and RecurrentScheduler.
+
+    Raises InvalidOptionError for a network without a memory, and for the mode one_pass: what the first agent of an
+    epoch sees does not go into the memories of the others.
+    """
+
+    def __init__(self, network: PolicyNetwork, **options: Unpack[PolicyOptions]) -> None:
+        super().__init__(network, **options)
+        if not isinstance(network, RecurrentNetwork):
+            raise InvalidOptionError(f"policy {self.name}: expected a recurrent network, got {type(network).__name__}")
+        self._recurrent = cast(RecurrentNetwork, self._network)
+        if self.mode == "one_pass":
+            raise InvalidOptionError(f"mode of policy {self.name}: expected greedy or sample, as it has a memory")
+        self.memory_size = network.memory_size
+
+    def decide(self, simulator: TurnSimulator) -> np.ndarray:
+        """See RecurrentScheduler; raises InvalidFileError for a simulator of another metagraph."""
+        self._check(simulator)
+        return super().decide(simulator)
+
+    def choose_recurrent(
+        self, observation: Observation, memory: np.ndarray, uniform: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Actions int64 (B,) and new memories float32 (B, memory_size); see RecurrentScheduler."""
+        logits, after = self.recur(observation, memory)
+        return self._pick(logits, uniform, observation), after
+
+    @torch.inference_mode()
+    def recur(self, observation: Observation, memory: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Logits float32 (B, n_actions) and new memories float32 (B, memory_size); raises as NetworkPolicy.logits."""
+        tensors, before = self._tensors(observation), _tensor(memory)
+        if len(before) == 1:
+            logits, after = self._recurrent.recur(tensors, before)
+        else:
+            logits, after = recurred_in_blocks(self._recurrent, tensors, before)
+        return logits.numpy(), after.numpy()
+
+
+def policy_of(network: PolicyNetwork, **options: Unpack[PolicyOptions]) -> NetworkPolicy | RecurrentPolicy:
+    """The policy that decides by a network, with a memory where the network has one; options as TrainedPolicy's."""
+    kind = RecurrentPolicy if isinstance(network, RecurrentNetwork) else NetworkPolicy
+    return kind(network, **options)
 
 
 def _tensor(array: np.ndarray) -> Tensor:

@@ -88,6 +88,8 @@ class Slot:
         tokens: incarnations whose liveliness token stands, the newest TOKENS of them.
         counts: what its incarnation counted, as it last said.
         early: the last hello that came before its incarnation's token.
+        remembered: decisions that its incarnation's memory held at the last one, None without a memory or before any.
+        memory_began: simulated time at which that memory was first decided with, None without a memory.
     """
 
     state: SlotState = SlotState.VACANT
@@ -104,10 +106,20 @@ class Slot:
     tokens: deque[str] = field(default_factory=lambda: deque(maxlen=TOKENS))
     counts: dict[str, int] = field(default_factory=dict)
     early: Hello | None = None
+    remembered: int | None = None
+    memory_began: int | None = None
 
     def move(self, event: SlotEvent) -> None:
         """Go where TRANSITIONS says; KeyError, which is a defect, where it says nothing."""
         self.state = TRANSITIONS[self.state, event]
+
+    def remember(self, remembered: int | None, time: int) -> bool:
+        """Note what an incarnation says of its memory at a decision; True if it is its first with a memory."""
+        began = remembered is not None and self.remembered is None
+        self.remembered = remembered
+        if began:
+            self.memory_began = time
+        return began
 
     @property
     def present(self) -> bool:
@@ -161,6 +173,7 @@ class Membership:
             slot.fenced.append(slot.incarnation)
         slot.move(SlotEvent.REGISTER)
         slot.incarnation, slot.policy, slot.heard_at, slot.until = incarnation, policy, now, math.inf
+        slot.remembered = None
 
     def cut(self, agent: int, until: float) -> None:
         """Stop hearing an incarnation; it may come back until then."""

@@ -30,10 +30,18 @@ class Ended(Struct, frozen=True, kw_only=True):
     exit_code: int
 
 
+class MemoryReport(Struct, frozen=True, kw_only=True):
+    """The memory of an agent's last incarnation that decided: since which simulated time, and of how many decisions."""
+
+    began: int
+    decisions: int
+
+
 class AgentReport(Struct, frozen=True, kw_only=True):
     """What an agent's slot saw of its incarnations.
 
     Attributes:
+        memory: None for an agent without one.
         counts: what the agent counted itself.
         figures: what the domain counts of it (`TurnSimulator.agent_figures`).
     """
@@ -44,6 +52,7 @@ class AgentReport(Struct, frozen=True, kw_only=True):
     turns: int
     losses: int
     waited_s: float
+    memory: MemoryReport | None = None
     counts: dict[str, int]
     figures: dict[str, float]
 
@@ -253,6 +262,13 @@ def _agent(name: str, slot: Slot, figures: dict[str, float]) -> AgentReport:
         turns=slot.turns,
         losses=slot.losses,
         waited_s=round(slot.waited_in_all, 4),
+        memory=_memory(slot),
         counts=dict(slot.counts),
         figures=figures,
     )
+
+
+def _memory(slot: Slot) -> MemoryReport | None:
+    if slot.memory_began is None:
+        return None
+    return MemoryReport(began=slot.memory_began, decisions=(slot.remembered or 0) + 1)

@@ -37,6 +37,9 @@ class Mind(Protocol):
     def learn(self, channel: str, payload: bytes) -> None:
         """Take in a channel's state; InvalidMessageError, and no change, if it does not parse."""
 
+    def forget(self) -> bool:
+        """Begin another incarnation, with an empty memory; whether this mind has a memory at all."""
+
 
 class AgentProtocol:
     """One agent of a run, from its first question to its goodbye; the first event is Reopened.
@@ -89,8 +92,8 @@ class AgentProtocol:
             case ev.TokenAppeared(key) if key == keys.WORLD_ALIVE:
                 if self.state == AgentState.SERVING and now - self._heard_at > self._heartbeat:
                     self._seek(now, out)  # back again, perhaps as another epoch
-            case ev.Chosen(sequence, action):
-                self._chosen(sequence, action, out)
+            case ev.Chosen():
+                self._chosen(event, out)
             case ev.Interrupted(number):
                 self._end(ev.End(ev.Ending.INTERRUPTED, f"signal {number}"), out)
         self._pass_time(now, out)
@@ -238,6 +241,9 @@ class AgentProtocol:
         if not self.incarnation:
             self._lives += 1
             self.incarnation = f"{self._identity}-{self._lives}"
+            if self._mind.forget() and self._tick > 0:
+                self.counts["empty_memory"] += 1
+                out.append(ev.Warn("memory", f"begins with an empty memory at {self._tick}"))
         token = self._keys.alive(self._agent, self.incarnation)
         if self._announced != token:
             self._announced = token
@@ -245,7 +251,7 @@ class AgentProtocol:
         self.state, self._hello_at = AgentState.JOINING, now
 
     def _forget(self, out: list[ev.Effect]) -> None:
-        """Give this incarnation up: the next one starts with nothing but its local state."""
+        """Give this incarnation up: the next one starts with nothing but its local state, its memory empty."""
         if self._announced:
             out.append(ev.Withdraw(self._announced))
         self._announced, self.incarnation, self._turn, self._sent = "", "", None, None
@@ -371,9 +377,9 @@ class AgentProtocol:
             self._choosing = turn
             out.append(ev.Choose(turn))
 
-    def _chosen(self, sequence: int, action: int, out: list[ev.Effect]) -> None:
+    def _chosen(self, chosen: ev.Chosen, out: list[ev.Effect]) -> None:
         turn, self._choosing = self._choosing, None
-        if turn is None or turn.sequence != sequence or turn.incarnation != self.incarnation:
+        if turn is None or turn.sequence != chosen.sequence or turn.incarnation != self.incarnation:
             return  # this life of the agent ended while its policy was thinking
         self._sent = wire.Decision(
             run=self._run,
@@ -382,7 +388,8 @@ class AgentProtocol:
             agent=self._agent,
             incarnation=turn.incarnation,
             sequence=turn.sequence,
-            action=action,
+            action=chosen.action,
+            remembered=chosen.remembered,
         )
         self.counts["decisions"] += 1
         out.append(ev.Put(self._keys.decision(self._agent), self._sent, control=True))

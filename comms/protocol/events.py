@@ -117,10 +117,11 @@ class PlantAdvanced:
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """The policy's action for turn `sequence`."""
+    """The policy's action for turn `sequence`; `remembered`: see messages.Decision."""
 
     sequence: int
     action: int
+    remembered: int | None = None
 
 
 @dataclass(frozen=True, slots=True)

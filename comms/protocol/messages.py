@@ -136,13 +136,18 @@ class Turn(Message, tag="turn.2", frozen=True):
 
 
 class Decision(Message, tag="decision.2", frozen=True):
-    """The answer to the turn with the same tick, agent, incarnation and sequence."""
+    """The answer to the turn with the same tick, agent, incarnation and sequence.
+
+    `remembered` counts the decisions that the agent's memory held when it chose: 0 for the first with an empty one, as
+    at the start of a run or after a restart. None: it decides without a memory.
+    """
 
     tick: Natural
     agent: Natural
     incarnation: Word
     sequence: Natural
     action: Natural
+    remembered: Natural | None = None
 
     def answers(self, turn: Turn) -> bool:
         """Whether this is the answer to that turn, and to no other."""

@@ -340,6 +340,8 @@ class WorldProtocol:
         if slot.state == SlotState.READY:
             slot.move(SlotEvent.ASK)
         self.members.answered(said.agent)
+        if slot.remember(said.remembered, self._tick):
+            out.append(ev.Note(said.agent, "memory began"))
         source = f"{said.incarnation}/{said.sequence}"
         self._choices[said.agent] = ev.Choice(said.agent, said.action, ev.Outcome.DECIDED, now - turn.asked_at, source)
 

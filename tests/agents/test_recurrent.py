@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from marl_sched.agents.recurrent import RecurrentScheduler, RememberingAgent
+from marl_sched.agents.recurrent import LocalAgent, RecurrentScheduler
 from marl_sched.domain import get_domain
 from marl_sched.errors import InvalidOptionError
 
@@ -50,7 +50,7 @@ def test_a_new_episode_forgets_in_its_rows_alone(simulator):
 
 def test_agents_by_themselves_choose_as_in_the_simulator(simulator):
     policy = Alternating()
-    alone = [[RememberingAgent(Alternating()) for _ in range(simulator.max_agents)] for _ in range(3)]
+    alone = [[LocalAgent(Alternating()) for _ in range(simulator.max_agents)] for _ in range(3)]
     policy.start(simulator, np.ones(3, bool))
     while not simulator.over.all():
         actions = policy.decide(simulator)
@@ -62,7 +62,7 @@ def test_agents_by_themselves_choose_as_in_the_simulator(simulator):
 
 
 def test_an_agent_that_is_started_again_begins_with_an_empty_memory(simulator):
-    agent = RememberingAgent(Alternating())
+    agent = LocalAgent(Alternating())
     own = {name: values[0] for name, values in simulator.observe(simulator.acting).items()}
     first = [agent.act(own) for _ in range(3)]
     agent.reset()

@@ -24,6 +24,7 @@ class Notebook:
 
     def __init__(self, channels: Sequence[str] = (CHANNEL,)) -> None:
         self.channels, self.learned = channels, []
+        self.remembers, self.forgotten = False, 0
 
     def meet(self, frame: wire.Frame) -> tuple[str, Sequence[str]]:
         self.learned.append("met")
@@ -33,6 +34,10 @@ class Notebook:
         if payload == b"bad":
             raise InvalidMessageError("bad")
         self.learned.append(payload)
+
+    def forget(self) -> bool:
+        self.forgotten += 1
+        return self.remembers
 
 
 class AgentDriver:

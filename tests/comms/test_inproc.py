@@ -116,8 +116,8 @@ def test_illegal_action_idles_the_agent_for_the_epoch(make_run):
             from marl_sched.comms.agent import PolicyMind
 
             class Stubborn(PolicyMind):
-                def choose(self, noise: float) -> int:
-                    return 10**6
+                def choose(self, noise: float) -> tuple[int, int | None]:
+                    return 10**6, None
 
             from marl_sched.comms.agent import Agent
             from marl_sched.comms.options import AgentOptions

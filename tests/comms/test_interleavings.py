@@ -27,6 +27,9 @@ class Mind:
     def learn(self, channel: str, payload: bytes) -> None:
         """All that is learnt is forgotten."""
 
+    def forget(self) -> bool:
+        return False
+
 
 class Universe:
     """A world, agents and the network between them; `faults` are (time, what, agent)."""

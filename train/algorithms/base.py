@@ -84,7 +84,13 @@ class Setup:
             split="train",
             horizon=2 * self.length.longest,  # cuts come before the end, so that a state at a cut still has a value
         )
-        return TrainingTask(problem=problem, scales=config.env.scales, length=self.length, **options)
+        return TrainingTask(
+            problem=problem,
+            scales=config.env.scales,
+            length=self.length,
+            memory=config.policy.memory_size,
+            **options,
+        )
 
     def policy(self, env: SchedulingTorchRL) -> PolicyNetwork:
         """A freshly drawn network. Weights are drawn on the CPU, so that a seed's are the same on every device."""

@@ -34,7 +34,8 @@ from marl_sched.train.collect import Collector, Rollout
 from marl_sched.train.device import device_of
 from marl_sched.train.estimators import seen_by_critic
 from marl_sched.train.learner import Learner
-from marl_sched.train.ppo import between, importance_subsample, means, minibatches
+from marl_sched.train.ppo import between, importance_subsample, means
+from marl_sched.train.sequences import logits_of, minibatches
 
 if TYPE_CHECKING:
     from marl_sched.train.config import TrainConfig
@@ -110,13 +111,14 @@ class Imitation:
         Raises InvalidOptionError for a teacher that prefers nothing in the first update.
         """
         config, device = self._config, device_of(self.policy)
-        samples = self._samples(rollout, rng).to(device)
+        samples = self._samples(rollout, rng)
+        on_device = samples.to(device)
         temperature = between(config.temperature, config.final_temperature, progress)
         for group in self.optimizer.param_groups:
             group["lr"] = between(config.learning_rate, config.final_learning_rate, progress)
         reports = [
-            self._step(samples[indices.to(device)], temperature)
-            for indices in minibatches(samples.shape[0], config.minibatch, config.epochs, rng)
+            self._step(on_device[indices.to(device)], temperature)
+            for indices in minibatches(samples, config.minibatch, config.epochs, rng)
         ]
         names = ("policy_loss", "regret", "entropy", "gradient")
         return dict(zip(names, means(reports), strict=True))
@@ -147,7 +149,7 @@ class Imitation:
 
     def _step(self, batch: TensorDict, temperature: float) -> Tensor:
         share = batch["weight"] / batch["weight"].sum()
-        log_probs = self.policy(batch).log_softmax(-1)
+        log_probs = logits_of(self.policy, batch).log_softmax(-1)
         legal = batch[ACTION_MASK] != 0
         advantages = torch.where(legal, batch["advantage"], -torch.inf)
         if self._config.criterion == "cross_entropy":
