@@ -127,9 +127,10 @@ def check_scheduler(
     """Hold a scheduler to its contract on a domain: `create` makes a fresh one.
 
     Its actions are int64 (B,) and legal; it decides the same when it plays again, and for an env of a batch the same
-    as alone; one that needs an observation alone decides the same from PettingZoo's.
+    as alone; one that needs an observation alone, or a memory too, decides the same as agents by themselves.
     """
     from marl_sched.agents.base import ObservationScheduler
+    from marl_sched.agents.recurrent import RecurrentScheduler
 
     problem = Problem(domain, scale=scale, count=BATCH, horizon=horizon, seed=5)
     together = _decisions(create(), problem.simulator())
@@ -144,6 +145,21 @@ def check_scheduler(
         single = {name: array[0] for name, array in seen.items()}
         chosen = scheduler.act(single, float(noise[0]))
         _require(chosen == alone[0][0], "act() on one observation chooses what decide() chooses")
+    if isinstance(scheduler, RecurrentScheduler):
+        by_themselves = _decisions_of_agents(create, problem.simulator([PLACE]))
+        _require(by_themselves == alone[0], "agents with memories of their own choose what decide() chooses")
+
+
+def _decisions_of_agents(create: Callable[[], Scheduler], simulator: TurnSimulator) -> list[int]:
+    """What agents choose in env 0, each by a scheduler and with a memory of its own."""
+    from marl_sched.agents.recurrent import LocalAgent
+
+    agents, made = [LocalAgent(create()) for _ in range(simulator.max_agents)], []  # type: ignore[arg-type]
+    while simulator.acting[0] >= 0:
+        seen, noise = simulator.observe(simulator.acting), simulator.policy_noise(simulator.acting)
+        made.append(agents[simulator.acting[0]].choose(seen, float(noise[0])))
+        simulator.step(np.array(made[-1:]))
+    return made
 
 
 def _decisions(scheduler: Scheduler, simulator: TurnSimulator) -> list[list[int]]:

@@ -287,3 +287,31 @@ def test_world_of_another_version_is_named():
     payload = wire.encode(FRAME).replace(b"frame.2", b"frame.1")
     (end,) = of(agent.at(0.1, ev.Answered(1, payload)), ev.End)
     assert end.reason == "the world speaks another version of the protocol: frame.1, this is 2"
+
+
+def test_every_incarnation_begins_with_an_empty_memory_and_one_that_joins_under_way_says_so():
+    agent = AgentDriver(join=False)
+    agent.mind.remembers = True
+    agent.answer(0.0, FRAME)
+    assert of(agent.answer(0.0, snapshot()), ev.Warn) == [ev.Warn("memory", "begins with an empty memory at 3")]
+    assert (agent.mind.forgotten, agent.protocol.counts["empty_memory"]) == (1, 1)
+    fenced = wire.Fenced(**US, agent=1, incarnation="me-1", why="given_up", reason="late")
+    agent.hear(1.0, "bot/1/turn", fenced)
+    agent.join(1.1)
+    assert (agent.protocol.incarnation, agent.mind.forgotten) == ("me-2", 2)
+
+
+def test_incarnation_keeps_its_memory_through_a_new_session():
+    agent = AgentDriver(silence=4.0)
+    while not of(agent.at(agent.protocol.wake_at), ev.Reopen):
+        pass
+    agent.at(4.5, ev.Reopened())
+    agent.join(4.6)
+    assert (agent.protocol.incarnation, agent.mind.forgotten) == ("me-1", 1)
+
+
+def test_decision_says_how_many_decisions_the_memory_held():
+    agent = AgentDriver()
+    agent.turn(1.0)
+    (decision,) = said(agent.at(1.1, ev.Chosen(1, 9, 4)), wire.Decision)
+    assert decision.remembered == 4

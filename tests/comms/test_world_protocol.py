@@ -369,3 +369,24 @@ def test_clock_is_told_once_a_heartbeat():
             times.append(now)
         world.keep_alive(now)
     assert times == [1.5, 2.0, 2.5, 3.0]
+
+
+def test_30_memory_is_noted_where_an_incarnation_first_decides_with_one():
+    world = WorldDriver(1, grace=5.0)
+    (turn,) = turns(world.gathered(1.0))
+    for remembered in (0, 1):
+        effects = world.decide(1.1, turn, remembered=remembered)
+        assert [note.event for note in of(effects, ev.Note)] == ["memory began"] * (remembered == 0)
+        (turn,) = turns(effects)
+    assert (world.slot(0).memory_began, world.slot(0).remembered) == (0, 1)
+    world.gone(1.2, 0)
+    (turn,) = turns(world.hello(1.3, 0, "b"))
+    assert ev.Note(0, "memory began") in world.decide(1.4, turn, remembered=0)
+    assert (turn.tick, world.slot(0).memory_began, world.slot(0).remembered) == (2, 2, 0)
+
+
+def test_30_agent_without_a_memory_has_none_in_its_slot():
+    world = WorldDriver(1)
+    (turn,) = turns(world.gathered(1.0))
+    world.decide(1.1, turn)
+    assert (world.slot(0).memory_began, world.slot(0).remembered) == (None, None)

@@ -7,10 +7,11 @@ from marl_sched.testing import check_domain, check_scheduler, check_view
 
 
 def test_the_domain_and_its_scheduler_hold_to_the_contract(installed):
-    from couriers.schedulers import OldestFirst
+    from couriers.schedulers import Itinerary, OldestFirst
 
     check_domain("couriers-deployable", instances=2)
     check_scheduler("couriers", OldestFirst)
+    check_scheduler("couriers", Itinerary)
 
 
 def far(reach):

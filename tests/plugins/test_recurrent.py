@@ -1,6 +1,7 @@
 """A recurrent policy of a domain from outside: trained, resumed, exported, and deployed as processes with memories."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -9,39 +10,38 @@ LEARN = (
     "env=couriers-deployable", "view=near", "view.reach=2", "policy=lstm", "policy.hidden=16", "policy.units=16",
     "algorithm=gae", "algorithm.instances=8", "algorithm.turns=32", "algorithm.reward_centering=false",
     "algorithm.ppo.minibatch=64", "algorithm.ppo.epochs=4", "algorithm.ppo.learning_rate=5e-3",
-    "algorithm.critic.layers=1", "validation.instances=8", "validation.every=10", "save_every=1",
-    "updates=10",
+    "algorithm.critic.layers=1", "validation.instances=8", "validation.every=8", "save_every=1",
+    "updates=8",
 )  # fmt: skip
 NEAR = {"kind": "near", "reach": 2}
 
 
 @pytest.fixture
 def trained(run, installed, tmp_path):
-    """Ten updates in one go, and the same run interrupted in its seventh and resumed."""
+    """Eight updates in one go, and the run's folder as a crash in the seventh leaves it, resumed."""
     from marl_sched.train.callbacks import Callback
     from marl_sched.train.config import load_config
     from marl_sched.train.run import train
 
-    class Interrupt(Callback):
-        """Ends the run when the turns of its seventh update are there, before they are learned from."""
+    whole, crashed = tmp_path / "whole", tmp_path / "crashed"
+
+    class Copy(Callback):
+        """Keeps the folder when the turns of the seventh update are there, before they are learned from."""
 
         def on_rollout(self, run, rollout):
             if run.counters.update == 6:
-                raise InterruptedError
+                shutil.copytree(whole, crashed)
 
-    whole, halves = tmp_path / "whole", tmp_path / "halves"
-    assert run("train", *LEARN, f"run_dir={whole}").code == 0
-    with pytest.raises(InterruptedError):
-        train(load_config([*LEARN, f"run_dir={halves}"]), [Interrupt()], quiet=True)
-    assert run("resume", halves).code == 0
-    return whole, halves
+    train(load_config([*LEARN, f"run_dir={whole}"]), [Copy()], quiet=True)
+    assert run("resume", crashed).code == 0
+    return whole, crashed
 
 
 @pytest.mark.slow
 def test_a_recurrent_policy_is_trained_resumed_exported_and_deployed(trained, run, tmp_path):
     """What is learned does not depend on the interruption; processes with memories play as one process does."""
-    whole, halves = trained
-    once, twice = _tensors(whole), _tensors(halves)
+    whole, crashed = trained
+    once, twice = _tensors(whole), _tensors(crashed)
     assert once.keys() == twice.keys()
     assert all(np.array_equal(once[name], twice[name]) for name in once)
     assert any(name.startswith("optimizer.exp_avg.policy.cell") and once[name].any() for name in once)
@@ -63,6 +63,124 @@ def test_a_recurrent_policy_is_trained_resumed_exported_and_deployed(trained, ru
     assert [agent["memory"]["decisions"] for agent in report["agents"]] == [
         sum(agent["name"] == name for name, _ in decisions) for agent in report["agents"]
     ]
+
+
+class DiedError(Exception):
+    """What ends an agent of a test."""
+
+
+def _save(folder, name):
+    """A policy of the LSTM network with weights so large that its memory matters; its path."""
+    import torch
+
+    from marl_sched.agents.networks.lstm import LstmNetwork
+    from marl_sched.agents.policies.cards import PolicyCard
+    from marl_sched.agents.policies.checkpoint import save_network
+    from marl_sched.domain import get_domain
+
+    network = LstmNetwork(get_domain("couriers-deployable").simulator.graph, hidden=8, layers=2, units=8)
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.normal_(std=0.7, generator=generator)
+    card = PolicyCard(
+        domain="couriers-deployable", objective="waiting", view=NEAR, graph=network.spec, sizes=network.sizes,
+        command="none", git_hash="none", seed=0, scores={}, mode="sample",
+    )  # fmt: skip
+    save_network(folder / name, network, card)
+    return str(folder / name)
+
+
+@pytest.fixture(params=["memory", "plan"])
+def carrying(request, installed, tmp_path):
+    """A policy whose agents carry a memory, and one whose agents carry a plan."""
+    return _save(tmp_path, "p.safetensors") if request.param == "memory" else "couriers.schedulers:Itinerary"
+
+
+def _options(seed):
+    from marl_sched.comms.options import WorldOptions
+
+    return WorldOptions(
+        env="couriers-deployable", scale="city", seed=seed, view="near", view_options={"reach": 4}, deadline=30.0,
+        ready_timeout=60.0,
+    )  # fmt: skip
+
+
+def test_deployed_in_one_process_every_agent_decides_as_in_the_batch_and_by_itself(carrying):
+    from marl_sched.agents.playing import play as play_alone
+    from marl_sched.agents.registry import create_scheduler
+    from marl_sched.comms.inproc import play
+
+    options = _options(4)
+    simulator = options.simulator()
+    report = play(options, [carrying] * int(simulator.n_agents[0]))
+    play_alone(create_scheduler(carrying, options.domain()), simulator)
+    assert report["M1"] == float(simulator.objectives()["waiting"][0])
+    assert report["rewards"] == _alone(carrying, options)[1]
+    assert next(event["day"] for event in report["events"] if event["event"] == "memory began") == 0
+    assert all(agent["memory"]["decisions"] == agent["turns"] for agent in report["agents"])
+    assert all("empty_memory" not in agent["counts"] for agent in report["agents"])
+
+
+def test_an_agent_that_is_started_again_begins_with_an_empty_memory_and_says_so(carrying, caplog):
+    """Courier 0 dies as it says its third decision; its successor takes the same turn, with nothing remembered."""
+    from marl_sched.comms.inproc import Threads
+
+    options = _options(4)
+    run = Threads(options, [carrying] * int(options.simulator().n_agents[0]))
+    said, once = [], run.run_agent
+
+    def die(key, payload):
+        said.append(key)
+        if sum(key.endswith("/decision") for key in said) == 3:
+            raise DiedError
+
+    def run_agent(index):
+        if index == 0:
+            run.nodes[0].on_put = die
+            once(0)
+            run.nodes[0] = run.bus.node()
+        once(index)
+
+    run.run_agent = run_agent
+    report = run.play()
+    assert [type(error) for error in run.errors] == [DiedError]
+    actions, rewards = _alone(carrying, options, forgets_at=2)
+    if carrying.endswith(".safetensors"):
+        assert actions != _alone(carrying, options)[0]  # what it had remembered matters
+    assert [(said["agent"], said["action"]) for said in report["decisions"]] == actions
+    assert report["rewards"] == rewards
+    first = report["agents"][0]
+    began = [e["day"] for e in report["events"] if (e["agent"], e["event"]) == ("courier_0", "memory began")]
+    assert len(began) == 2
+    assert first["memory"] == {"began": began[1], "decisions": first["turns"] - 2 - 1}
+    assert first["counts"]["empty_memory"] == 1
+    assert f"begins with an empty memory at {began[1]}" in caplog.text
+
+
+def _alone(policy, options, forgets_at=None):
+    """Each agent by itself on the simulator: (agent, action) of every decision and the rewards.
+
+    Agent 0 forgets before its decision number `forgets_at`, counted from 0.
+    """
+    from marl_sched.agents.recurrent import LocalAgent
+    from marl_sched.agents.registry import create_scheduler
+
+    simulator, domain = options.simulator(), options.domain()
+    agents = [LocalAgent(create_scheduler(policy, domain)) for _ in range(simulator.max_agents)]
+    decisions, rewards, own = [], [], 0
+    while not simulator.over[0]:
+        agent = int(simulator.acting[0])
+        if agent == 0:
+            if own == forgets_at:
+                agents[0].reset()
+            own += 1
+        seen, noise = simulator.observe(simulator.acting), simulator.policy_noise(simulator.acting)
+        action = agents[agent].choose(seen, float(noise[0]))
+        decisions.append((domain.agent_name(agent), action))
+        simulator.step(np.array([action]))
+        rewards.append(float(simulator.reward[0]))
+    return decisions, rewards
 
 
 def _tensors(run_dir):
