@@ -13,7 +13,7 @@ from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from marl_sched.agents.base import Scheduler
+from marl_sched.agents.base import ObservationScheduler, Scheduler
 from marl_sched.agents.policies.cards import Mode, PolicyCard, read_card
 from marl_sched.domain import Domain, domain_names, get_domain
 from marl_sched.errors import InvalidFileError, InvalidOptionError, MarlSchedError, UnknownNameError
@@ -88,11 +88,13 @@ def create_scheduler(name_or_path: str | Path, domain: Domain | str, **options: 
     return policy if samples is None else _best_of(policy, samples, domain_name)
 
 
-def _best_of(policy: NetworkPolicy, samples: int, domain: str) -> Scheduler:
+def _best_of(policy: NetworkPolicy | RecurrentPolicy, samples: int, domain: str) -> Scheduler:
     """What follows the best of so many samples of a policy; InvalidOptionError where the domain has no such thing."""
     best_of = get_domain(domain).best_of
     if best_of is None:
         raise InvalidOptionError(f"scheduler {policy.name}: samples: schedules of {domain} are not sampled")
+    if not isinstance(policy, ObservationScheduler):
+        raise InvalidOptionError(f"scheduler {policy.name}: samples: expected a policy without a memory")
     made: Scheduler = best_of(policy, samples)
     return made
 

@@ -21,7 +21,8 @@ from marl_sched.train.bounds import Count, NonNegative, Positive
 from marl_sched.train.collect import Collector, EpisodeCollector, Rollout
 from marl_sched.train.device import device_of
 from marl_sched.train.learner import Learner
-from marl_sched.train.ppo import between, importance_subsample, means, minibatches
+from marl_sched.train.ppo import between, importance_subsample, means
+from marl_sched.train.sequences import logits_of, minibatches
 
 
 class SelfLabellingConfig(
@@ -74,16 +75,16 @@ class SelfLabelling:
             return report
         samples, names, (turn, row) = importance_subsample(self.policy, rollout, labelled, config.min_keep_prob, rng)
         samples["label"] = (names == rollout.actions[turn, row][:, None]).int().argmax(1)
-        samples = samples.to(device)
+        on_device = samples.to(device)
         reports = [
-            self._step(samples[indices.to(device)])
-            for indices in minibatches(samples.shape[0], config.minibatch, config.epochs, rng)
+            self._step(on_device[indices.to(device)])
+            for indices in minibatches(samples, config.minibatch, config.epochs, rng)
         ]
         return report | dict(zip(("policy_loss", "entropy", "gradient"), means(reports), strict=True))
 
     def _step(self, batch: TensorDict) -> Tensor:
         share = batch["weight"] / batch["weight"].sum()
-        log_probs = self.policy(batch).log_softmax(-1)
+        log_probs = logits_of(self.policy, batch).log_softmax(-1)
         loss = -(share @ log_probs.gather(1, batch["label"][:, None]).squeeze(1))
         self.optimizer.zero_grad()
         loss.backward()
