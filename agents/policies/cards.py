@@ -24,7 +24,7 @@ Width = Annotated[int, Meta(ge=1, le=1024)]
 Heads = Annotated[int, Meta(ge=1, le=64)]
 Layers = Annotated[int, Meta(ge=1, le=32)]
 Slots = Annotated[int, Meta(ge=1, le=65536)]
-Mode = Literal["greedy", "sample", "one_pass"]  # see marl_sched.agents.policies.network_policy.NetworkPolicy
+Mode = Literal["greedy", "sample", "one_pass"]  # see marl_sched.agents.policies.network_policy.TrainedPolicy
 _ARCHITECTURE = "architecture"
 
 

@@ -33,7 +33,7 @@ def same(a: Rollout, b: Rollout) -> bool:
 
 
 def test_the_training_environment_keeps_its_specs():
-    check_env_specs(task(rows=2, central=True, memory=(3, 2)).environment())
+    check_env_specs(task(rows=2, central=True, memory=3).environment())
 
 
 def test_whole_episodes_are_cut_at_the_length_in_every_row(policy: HetGATNetwork):

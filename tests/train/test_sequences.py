@@ -69,8 +69,8 @@ def networks() -> tuple[LstmNetwork, HetGATCritic]:
 
 
 def segments(policy: LstmNetwork):
-    """Two updates of 30 turns of 4 rows, with episodes of 8 hours."""
-    playing = task(central=True, memory=policy.memory_size)
+    """Two updates of 120 turns of 4 rows, with episodes of 20 hours."""
+    playing = task(central=True, turns=120, length=20, memory=policy.memory_size)
     collector = SegmentCollector(playing)
     return [collector.collect(policy, playing.length(0)) for _ in range(2)]
 
