@@ -118,6 +118,10 @@ class Mind:
         if len(payload) != 1:
             raise InvalidMessageError("a state has one byte")
 
+    def forget(self) -> bool:
+        """See Mind.forget of the agent's protocol."""
+        return False
+
 
 class WorldUnderFuzz:
     """A world of three agents, each with a channel, whose plant asks them in turn for ever."""

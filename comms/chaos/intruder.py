@@ -79,7 +79,7 @@ def forgeries(order: Order, epoch: str, number: int) -> list[tuple[str, bytes]]:
         (f"{prefix}/{victim}/turn", wire.Refused(**us, reason="forged")),
         (
             f"{prefix}/{victim}/decision",
-            wire.Decision(**us, tick=number, agent=victim, incarnation="x", sequence=number, action=1),
+            wire.Decision(**us, tick=number, agent=victim, incarnation="x", sequence=number, action=1, remembered=None),
         ),
         (f"{prefix}/{victim}/hello", wire.Hello(**us, agent=victim, incarnation=f"x-{number}", policy="forged")),
         (f"{prefix}/{victim}/hello", wire.Beat(**us, agent=victim, incarnation="x", tick=LATE, counts={})),

@@ -102,11 +102,11 @@ def carrying(request, installed, tmp_path):
 
 def _options(seed):
     from marl_sched.comms.options import WorldOptions
+    from marl_sched.problem import Problem
 
-    return WorldOptions(
-        env="couriers-deployable", scale="city", seed=seed, view="near", view_options={"reach": 4}, deadline=30.0,
-        ready_timeout=60.0,
-    )  # fmt: skip
+    view = {"kind": "near", "reach": 4}
+    problem = Problem("couriers-deployable", scale="city", count=1, seed=seed, view=view)
+    return WorldOptions(problem=problem, deadline=30.0, ready_timeout=60.0)
 
 
 def test_deployed_in_one_process_every_agent_decides_as_in_the_batch_and_by_itself(carrying):
@@ -116,8 +116,8 @@ def test_deployed_in_one_process_every_agent_decides_as_in_the_batch_and_by_itse
 
     options = _options(4)
     simulator = options.simulator()
-    report = play(options, [carrying] * int(simulator.n_agents[0]))
-    play_alone(create_scheduler(carrying, options.domain()), simulator)
+    report = play(options, [carrying] * int(simulator.n_agents[0])).as_json()
+    play_alone(create_scheduler(carrying, options.domain), simulator)
     assert report["M1"] == float(simulator.objectives()["waiting"][0])
     assert report["rewards"] == _alone(carrying, options)[1]
     assert next(event["day"] for event in report["events"] if event["event"] == "memory began") == 0
@@ -146,7 +146,7 @@ def test_an_agent_that_is_started_again_begins_with_an_empty_memory_and_says_so(
         once(index)
 
     run.run_agent = run_agent
-    report = run.play()
+    report = run.play().as_json()
     assert [type(error) for error in run.errors] == [DiedError]
     actions, rewards = _alone(carrying, options, forgets_at=FORGETS)
     if carrying.endswith(".safetensors"):
@@ -169,7 +169,7 @@ def _alone(policy, options, forgets_at=None):
     from marl_sched.agents.recurrent import LocalAgent
     from marl_sched.agents.registry import create_scheduler
 
-    simulator, domain = options.simulator(), options.domain()
+    simulator, domain = options.simulator(), options.domain
     agents = [LocalAgent(create_scheduler(policy, domain)) for _ in range(simulator.max_agents)]
     decisions, rewards, own = [], [], 0
     while not simulator.over[0]:
