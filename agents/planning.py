@@ -3,7 +3,7 @@
 A plan is followed until it holds no longer, by default when it is spent or when the action that comes next is not legal
 any more; then another one is made. There are two ways to plan:
 
-- for the whole team, from the simulator (`PlanningScheduler`, `SequencePlanner`), as a whole round or a sequence for
+- for the whole team, from the simulator (`TeamPlanner`, `SequencePlanner`), as a whole round or a sequence for
   each agent. Whoever needs the simulator cannot be deployed.
 - every agent for itself, from what it sees (`AgentPlanner`). What is left of its plan is its memory, so it plays in a
   simulator, in evaluation and as a process like every other RecurrentScheduler, and an agent that is started again
@@ -32,7 +32,7 @@ P = TypeVar("P")
 SPENT = -1  # in place of an action: the plan ends here
 
 
-class PlanningScheduler(Scheduler, Generic[P]):
+class TeamPlanner(Scheduler, Generic[P]):
     """Plans for all agents of an env, on the simulator, and takes their turns by the plan.
 
     Attributes:
@@ -81,7 +81,7 @@ class PlanningScheduler(Scheduler, Generic[P]):
         return actions
 
 
-class SequencePlanner(PlanningScheduler[dict[int, deque[int]]]):
+class SequencePlanner(TeamPlanner[dict[int, deque[int]]]):
     """A plan is a sequence of actions for every agent, one for each of its coming turns; `sequences` makes it.
 
     An env is planned anew when the acting agent's sequence is spent or its next action is not legal. Where the new plan

@@ -26,7 +26,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from marl_sched.agents.murse.following import RoundPlanner
+from marl_sched.agents.murse.following import PlanningScheduler
 from marl_sched.agents.murse.latest_start import (
     common_horizon,
     latest_starts,
@@ -234,7 +234,7 @@ def dispatched(problem: Round, rule: str) -> Plan:
     return begun.plan(problem, count)
 
 
-class DispatchingRule(RoundPlanner):
+class DispatchingRule(PlanningScheduler):
     """Plays a rule of DISPATCHING_RULES; in `online` mode anew whenever a task did not end when it was expected to."""
 
     def __init__(self, rule: str) -> None:

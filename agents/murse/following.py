@@ -10,14 +10,14 @@ from marl_sched.agents.base import EpochPlayer
 from marl_sched.agents.murse.problem import Plan
 from marl_sched.agents.murse.snapshot import as_murse
 from marl_sched.agents.murse.whole_rounds import round_player
-from marl_sched.agents.planning import PlanningScheduler
+from marl_sched.agents.planning import TeamPlanner
 from marl_sched.envs.murse.simulator import MurseSimulator
 from marl_sched.envs.murse.state import NOBODY
 from marl_sched.privileged import PrivilegedInfo
 from marl_sched.simulation import TurnSimulator
 
 
-class RoundPlanner(PlanningScheduler[Plan]):
+class PlanningScheduler(TeamPlanner[Plan]):
     """Makes a plan when a round begins and follows it turn by turn; `plan` is what a subclass adds.
 
     A plan holds for its round, and `revise` is asked before every turn but a round's first. An agent takes its next

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from marl_sched.agents.murse.following import RoundPlanner
+from marl_sched.agents.murse.following import PlanningScheduler
 from marl_sched.agents.murse.list_schedule import edf_schedule
 from marl_sched.agents.murse.problem import Plan, Round, timed
 from marl_sched.agents.murse.snapshot import estimated_round
@@ -15,7 +15,7 @@ from marl_sched.envs.murse.timetable import time_batch
 from marl_sched.errors import InvalidOptionError
 
 
-class GeneticEdf(RoundPlanner):
+class GeneticEdf(PlanningScheduler):
     """Improves EDF's schedule of every round on estimated durations; see `evolve` for the options."""
 
     name = "genetic-edf"

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from marl_sched.agents.murse import latest_start as kernels
-from marl_sched.agents.murse.following import RoundPlanner
+from marl_sched.agents.murse.following import PlanningScheduler
 from marl_sched.agents.murse.problem import Plan, Round
 from marl_sched.agents.murse.snapshot import as_expected, estimated_round, remaining_round
 from marl_sched.envs.murse.simulator import MurseSimulator
@@ -128,7 +128,7 @@ class _Partial:
         )
 
 
-class LeastLatestStart(RoundPlanner):
+class LeastLatestStart(PlanningScheduler):
     """Plans a round by the rule and, in `online` mode, anew whenever a task did not end when the plan had it end.
 
     What is committed to stays, running tasks end at their expected times. `margin` standard deviations of each

@@ -8,7 +8,7 @@ import numpy as np
 
 from marl_sched.agents.murse.best_rule import best_rule_plan
 from marl_sched.agents.murse.exact import WORK_LIMIT, Solution, require_limits, solve
-from marl_sched.agents.murse.following import RoundPlanner
+from marl_sched.agents.murse.following import PlanningScheduler
 from marl_sched.agents.murse.problem import Plan, Round, timed
 from marl_sched.agents.murse.snapshot import as_expected, estimated_round, remaining_round
 from marl_sched.envs.murse.instance import MurseInstance
@@ -28,7 +28,7 @@ class Limits(TypedDict):
     threads: int
 
 
-class ExactScheduler(RoundPlanner):
+class ExactScheduler(PlanningScheduler):
     """Solves every round on estimated durations with CP-SAT, from the best rule's plan on, and follows the solution.
 
     Without limits a run gets WORK_LIMIT deterministic seconds; `time_limit` is in wall seconds. A round for which

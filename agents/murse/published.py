@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from marl_sched.agents.murse.following import RoundPlanner
+from marl_sched.agents.murse.following import PlanningScheduler
 from marl_sched.agents.murse.genetic import GeneticEdf, evolve, swap_order
 from marl_sched.agents.murse.problem import Plan, Round, timed
 from marl_sched.agents.murse.snapshot import estimated_round
@@ -140,7 +140,7 @@ def published_schedule(problem: Round) -> Plan:
     return timed(problem, *published_order(problem.durations, problem.lags, problem.near, problem.deadlines))
 
 
-class EdfPublished(RoundPlanner):
+class EdfPublished(PlanningScheduler):
     """Plans every round by the published rule on estimated durations."""
 
     name = "edf-published"

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from marl_sched.agents.base import inverse_distribution
-from marl_sched.agents.murse.following import RoundPlanner
+from marl_sched.agents.murse.following import PlanningScheduler
 from marl_sched.agents.murse.problem import Plan, plan_cost, timed
 from marl_sched.agents.murse.snapshot import as_murse, estimated_round
 from marl_sched.envs.murse.simulator import MurseSimulator
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from marl_sched.agents.policies.network_policy import NetworkPolicy
 
 
-class BestOfSamples(RoundPlanner):
+class BestOfSamples(PlanningScheduler):
     """Plans a round by the best of a policy's schedules, the greedy one among them; ties to the first.
 
     Args:
@@ -42,7 +42,7 @@ class BestOfSamples(RoundPlanner):
         self._policy, self._samples = policy, samples
 
     def start(self, simulator: TurnSimulator, envs: np.ndarray) -> None:
-        """See RoundPlanner."""
+        """See PlanningScheduler."""
         murse = as_murse(simulator)
         if murse.mode != "plan" or murse.view.hides:
             raise InvalidOptionError(

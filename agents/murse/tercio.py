@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from marl_sched.agents.murse.exact import ortools
-from marl_sched.agents.murse.following import RoundPlanner
+from marl_sched.agents.murse.following import PlanningScheduler
 from marl_sched.agents.murse.lst import keyed_plan, lst_plan
 from marl_sched.agents.murse.problem import Plan, Round, plan_cost
 from marl_sched.agents.murse.snapshot import estimated_round
@@ -36,7 +36,7 @@ _PROGRAM_GAP = 0.05
 ALLOCATIONS = 5
 
 
-class Tercio(RoundPlanner):
+class Tercio(PlanningScheduler):
     """Plans every round by `tercio` on estimated durations."""
 
     name = "tercio"
