@@ -12,11 +12,12 @@ and so is `LoggerCallback`, which hands every number to one of TorchRL's loggers
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from torchrl.record.loggers import get_logger
 
@@ -27,6 +28,7 @@ from marl_sched.train.collect import Rollout
 if TYPE_CHECKING:
     from marl_sched.train.parts import Parts
 
+PROJECT = "marl-sched"  # in trackio
 LoggerName = Literal["csv", "mlflow", "tensorboard", "trackio", "wandb"]
 
 
@@ -67,8 +69,9 @@ class Callback:
 class LoggerCallback(Callback):
     """Every number of a run to one of TorchRL's loggers, by its word in the configuration.
 
-    `tensorboard` and `csv` write into folders of these names in the run's folder, `mlflow` likewise, `wandb` and
-    `trackio` under the name of the run's folder to where they are told to (their own settings).
+    `tensorboard` and `csv` write into folders of these names in the run's folder. `mlflow` writes to where
+    MLFLOW_TRACKING_URI says, else to `mlflow/mlflow.db` there. `wandb` and `trackio` go by their own settings; the run
+    has its folder's name.
 
     Args:
         name: which. Raises MarlSchedError, with the extra that brings it, where its package is not installed.
@@ -79,19 +82,18 @@ class LoggerCallback(Callback):
             extra = "train" if name == "tensorboard" else name
             raise MarlSchedError(f"logger={name}: {name} is not installed: pip install 'marl-sched[{extra}]'")
         self._name = name
+        self._logger: Any = None
 
     def on_start(self, run: Run) -> None:
         """Open the logger; where TensorBoard goes on, points after the last checkpoint are dropped."""
-        in_folder = self._name in ("csv", "tensorboard")
-        folder, experiment = (run.directory, self._name) if in_folder else (run.directory / self._name, run.directory)
-        self._logger = get_logger(self._name, str(folder), Path(experiment).name or "run")
+        self._logger = _open(self._name, run.directory)
         if self._name == "tensorboard" and run.counters.update:
             self._drop_later(run.counters.update + 1)
 
     def _drop_later(self, step: int) -> None:
         from tensorboard.compat.proto.event_pb2 import Event, SessionLog  # type: ignore[import-untyped]
 
-        writer = self._logger.experiment.file_writer  # type: ignore[union-attr]  # TensorBoard's own
+        writer = self._logger.experiment.file_writer
         writer.add_event(Event(step=step, file_version="brain.Event:2"))
         writer.add_event(Event(step=step, session_log=SessionLog(status=SessionLog.START)))
 
@@ -99,7 +101,7 @@ class LoggerCallback(Callback):
         """Log every number at the update's step."""
         for name, value in values.items():
             if name != "update":
-                self._logger.log_scalar(name, float(value), step=int(values["update"]))  # type: ignore[union-attr]
+                self._logger.log_scalar(name, float(value), step=int(values["update"]))
 
     def on_end(self, run: Run) -> None:
         """Close what has to be closed, so that every number is kept."""
@@ -108,3 +110,17 @@ class LoggerCallback(Callback):
             if hasattr(experiment, close):
                 getattr(experiment, close)()
                 return
+
+
+def _open(name: LoggerName, directory: Path) -> Any:
+    """TorchRL's logger of that name for a run in a folder."""
+    run, own = directory.absolute().name, directory / name
+    if name in ("csv", "tensorboard"):
+        return get_logger(name, str(directory), name)
+    if name != "mlflow":
+        return get_logger(name, str(own), run, trackio_kwargs={"project": PROJECT})
+    from torchrl.record.loggers.mlflow import MLFlowLogger
+
+    own.mkdir(exist_ok=True)  # get_logger knows no other store than files, which MLflow 3 refuses
+    where = os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{own.absolute()}/mlflow.db"
+    return MLFlowLogger(exp_name=run, tracking_uri=where, artifact_location=own.absolute().as_uri())
