@@ -20,7 +20,7 @@ demo: $(INSTALLED) ## seven crews as processes for thirty days, compared with ce
 test: unit wheel ## all tests, then the wheel in a second environment
 
 unit: $(INSTALLED) ## the tests alone; PYTEST_ARGS="-k noise" are pytest's, by default those that use every core
-	NUMBA_CACHE_DIR=$(CURDIR)/build/numba OMP_NUM_THREADS=1 $(BIN)/pytest $(PYTEST_ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/pytest $(PYTEST_ARGS)
 
 # The second environment borrows the dependencies of the first through a .pth file; the editable install does not
 # come along, since .pth files are not read from there. The wheel must do without the checkout.
@@ -48,7 +48,7 @@ docs-serve: $(INSTALLED) ## the same on localhost, renewed with every change
 	$(BIN)/python -m mkdocs serve
 
 coverage: $(INSTALLED) ## which lines of what is not compiled no test runs, in build/coverage/
-	OMP_NUM_THREADS=1 NUMBA_CACHE_DIR=$(CURDIR)/build/numba $(BIN)/pytest --cov --cov-report=term:skip-covered \
+	OMP_NUM_THREADS=1 $(BIN)/pytest --cov --cov-report=term:skip-covered \
 		--cov-report=html:build/coverage $(PYTEST_ARGS)
 
 tables-murse: $(INSTALLED) ## the page about MuRSE in docs/results/, only the cells that are missing

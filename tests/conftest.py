@@ -1,7 +1,23 @@
-"""Settings of every test."""
+"""Settings of every test, and kernels that are compiled once before several processes run tests."""
 
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
 from hypothesis import settings
 
 # A kernel's first call compiles it and would miss any deadline; the same commit tries the same examples.
 settings.register_profile("marl_sched", deadline=None, derandomize=True)
 settings.load_profile("marl_sched")
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Where tests run in several processes, compile first, a process for each domain."""
+    config = session.config
+    if hasattr(config, "workerinput") or not getattr(config.option, "numprocesses", None):
+        return
+    warm = Path(__file__).with_name("warm.py")
+    running = [subprocess.Popen([sys.executable, "-P", str(warm), domain]) for domain in ("airme", "murse")]
+    if any([process.wait() for process in running]):
+        raise pytest.UsageError("compiling the kernels failed; see above")
