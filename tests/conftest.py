@@ -19,5 +19,6 @@ def pytest_sessionstart(session: pytest.Session) -> None:
         return
     warm = Path(__file__).with_name("warm.py")
     running = [subprocess.Popen([sys.executable, "-P", str(warm), domain]) for domain in ("airme", "murse")]
-    if any([process.wait() for process in running]):
+    codes = [process.wait() for process in running]
+    if any(codes):
         raise pytest.UsageError("compiling the kernels failed; see above")
