@@ -14,13 +14,12 @@ sum over a of pi(a) A(a) + temperature x entropy (AggreVaTeD; Sun et al. 2017).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
-from msgspec import Meta, Struct
 from tensordict import TensorDict
-from torch import Tensor, nn
+from torch import Tensor
 
 from marl_sched.agents.base import AdvantageScheduler
 from marl_sched.agents.networks.network import PolicyNetwork
@@ -28,14 +27,13 @@ from marl_sched.agents.registry import create_scheduler
 from marl_sched.errors import InvalidOptionError
 from marl_sched.graph import ACTION_MASK
 from marl_sched.privileged import PrivilegedInfo
-from marl_sched.train.algorithms.base import NAME, AlgorithmConfig, Setup
-from marl_sched.train.bounds import Count, NonNegative, Positive
+from marl_sched.train.algorithms.base import NAME, Setup
+from marl_sched.train.algorithms.supervised import SupervisedConfig, SupervisedLearner
+from marl_sched.train.bounds import Count, Positive
 from marl_sched.train.collect import Collector, Rollout
-from marl_sched.train.device import device_of
 from marl_sched.train.estimators import seen_by_critic
 from marl_sched.train.learner import Learner
-from marl_sched.train.ppo import between, importance_subsample, means
-from marl_sched.train.sequences import logits_of, minibatches
+from marl_sched.train.ppo import between, importance_subsample
 
 if TYPE_CHECKING:
     from marl_sched.train.config import TrainConfig
@@ -43,9 +41,7 @@ if TYPE_CHECKING:
 LEAST = -10.0  # no choice counts as worse than this, in units of what the best choice is usually worth
 
 
-class ImitationConfig(
-    AlgorithmConfig, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field=NAME, tag="imitation"
-):
+class ImitationConfig(SupervisedConfig, frozen=True, kw_only=True, tag_field=NAME, tag="imitation"):
     """Choices scored by a scheduler that knows more; temperature and learning rate change linearly.
 
     `criterion` is what is optimised: see the module's page.
@@ -57,14 +53,8 @@ class ImitationConfig(
     turns: Count
     teacher: str
     criterion: Literal["cross_entropy", "expected_advantage"]
-    epochs: Count
-    minibatch: Count
-    learning_rate: Positive
-    final_learning_rate: NonNegative
     temperature: Positive
     final_temperature: Positive
-    max_grad_norm: Positive
-    min_keep_prob: Annotated[float, Meta(gt=0, le=1)]
 
     def build(self, setup: Setup) -> tuple[Collector, Learner]:
         """See AlgorithmConfig; raises InvalidOptionError for a scheduler that cannot teach."""
@@ -90,7 +80,7 @@ class ImitationConfig(
         return [f"imitation of {teacher.name}{known}", *shown]
 
 
-class Imitation:
+class Imitation(SupervisedLearner):
     """Learns what a teacher would choose.
 
     Args:
@@ -99,10 +89,11 @@ class Imitation:
         config: see ImitationConfig.
     """
 
+    figures = ("regret", "entropy")
+
     def __init__(self, policy: PolicyNetwork, teacher: AdvantageScheduler, config: ImitationConfig) -> None:
-        self.policy, self._teacher, self._config = policy, teacher, config
-        self.modules: dict[str, nn.Module] = {"policy": policy}
-        self.optimizer = torch.optim.Adam(policy.parameters(), fused=True)
+        super().__init__(policy, config)
+        self._teacher, self._config = teacher, config
         self._scale: float | None = None
 
     def learn(self, rollout: Rollout, progress: float, rng: np.random.Generator) -> dict[str, float]:
@@ -110,18 +101,7 @@ class Imitation:
 
         Raises InvalidOptionError for a teacher that prefers nothing in the first update.
         """
-        config, device = self._config, device_of(self.policy)
-        samples = self._samples(rollout, rng)
-        on_device = samples.to(device)
-        temperature = between(config.temperature, config.final_temperature, progress)
-        for group in self.optimizer.param_groups:
-            group["lr"] = between(config.learning_rate, config.final_learning_rate, progress)
-        reports = [
-            self._step(on_device[indices.to(device)], temperature)
-            for indices in minibatches(samples, config.minibatch, config.epochs, rng)
-        ]
-        names = ("policy_loss", "regret", "entropy", "gradient")
-        return dict(zip(names, means(reports), strict=True))
+        return self.fit(self._samples(rollout, rng), progress, rng)
 
     def _samples(self, rollout: Rollout, rng: np.random.Generator) -> TensorDict:
         samples, names, (turn, row) = importance_subsample(
@@ -147,25 +127,16 @@ class Imitation:
             )
         return usual
 
-    def _step(self, batch: TensorDict, temperature: float) -> Tensor:
-        share = batch["weight"] / batch["weight"].sum()
-        log_probs = logits_of(self.policy, batch).log_softmax(-1)
-        legal = batch[ACTION_MASK] != 0
-        advantages = torch.where(legal, batch["advantage"], -torch.inf)
+    def _losses(self, batch: TensorDict, log_probs: Tensor, progress: float) -> Tensor:
+        temperature = between(self._config.temperature, self._config.final_temperature, progress)
         if self._config.criterion == "cross_entropy":
-            losses = cross_entropy(log_probs, (advantages / temperature).softmax(-1))
-        else:
-            losses = -expected_advantage(log_probs, batch["advantage"], temperature)
-        loss = share @ losses
-        self.optimizer.zero_grad()
-        loss.backward()
-        norm = nn.utils.clip_grad_norm_(self.policy.parameters(), self._config.max_grad_norm)
-        self.optimizer.step()
-        with torch.no_grad():
-            probs = log_probs.exp()
-            regret = share @ (advantages.max(1).values - (probs * batch["advantage"]).sum(-1))
-            entropy = share @ cross_entropy(log_probs, probs)
-            return torch.stack([loss, regret, entropy, norm])
+            return cross_entropy(log_probs, (_legal_advantages(batch) / temperature).softmax(-1))
+        return -expected_advantage(log_probs, batch["advantage"], temperature)
+
+    def _figures(self, batch: TensorDict, log_probs: Tensor) -> list[Tensor]:
+        probs = log_probs.exp()
+        regret = _legal_advantages(batch).max(1).values - (probs * batch["advantage"]).sum(-1)
+        return [regret, cross_entropy(log_probs, probs)]
 
     def state(self) -> dict[str, float | None]:
         """The scale of advantages."""
@@ -174,6 +145,10 @@ class Imitation:
     def restore(self, state: dict[str, float | None]) -> None:
         """The scale of advantages."""
         self._scale = state["scale"]
+
+
+def _legal_advantages(batch: TensorDict) -> Tensor:
+    return torch.where(batch[ACTION_MASK] != 0, batch["advantage"], -torch.inf)
 
 
 def cross_entropy(log_probs: Tensor, wanted: Tensor) -> Tensor:

@@ -12,25 +12,23 @@ temperature x entropy (AggreVaTeD; Sun et al. 2017).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
-from msgspec import Meta, Struct
 from tensordict import TensorDict
-from torch import Tensor, nn
+from torch import Tensor
 
 from marl_sched.agents.networks.network import PolicyNetwork
 from marl_sched.agents.registry import create_scheduler
-from marl_sched.train.algorithms.base import NAME, AlgorithmConfig, Setup
+from marl_sched.train.algorithms.base import NAME, Setup
 from marl_sched.train.algorithms.imitation import cross_entropy, expected_advantage
-from marl_sched.train.bounds import Count, NonNegative, Positive
+from marl_sched.train.algorithms.supervised import SupervisedConfig, SupervisedLearner
+from marl_sched.train.bounds import Count, Positive
 from marl_sched.train.collect import Collector, Rollout
-from marl_sched.train.device import device_of
 from marl_sched.train.environment import COSTS
 from marl_sched.train.learner import Learner
-from marl_sched.train.ppo import between, importance_subsample, means
-from marl_sched.train.sequences import logits_of, minibatches
+from marl_sched.train.ppo import between, importance_subsample
 
 if TYPE_CHECKING:
     from marl_sched.train.config import TrainConfig
@@ -39,15 +37,7 @@ WORST = 1.0
 """The excess cost that a choice counts with at most, except by cross-entropy."""
 
 
-class RolloutImitationConfig(
-    AlgorithmConfig,
-    Struct,
-    frozen=True,
-    kw_only=True,
-    forbid_unknown_fields=True,
-    tag_field=NAME,
-    tag="rollout_imitation",
-):
+class RolloutImitationConfig(SupervisedConfig, frozen=True, kw_only=True, tag_field=NAME, tag="rollout_imitation"):
     """Choices whose costs a teacher works out; temperature and learning rate change linearly.
 
     Rows play on from update to update, `turns` turns each, with the policy that learns.
@@ -57,14 +47,8 @@ class RolloutImitationConfig(
     turns: Count
     teacher: str
     criterion: Literal["cross_entropy", "expected_cost"]
-    epochs: Count
-    minibatch: Count
-    learning_rate: Positive
-    final_learning_rate: NonNegative
     temperature: Positive
     final_temperature: Positive
-    max_grad_norm: Positive
-    min_keep_prob: Annotated[float, Meta(gt=0, le=1)]
 
     def build(self, setup: Setup) -> tuple[Collector, Learner]:
         """See AlgorithmConfig; raises InvalidOptionError for a scheduler that cannot teach."""
@@ -78,7 +62,7 @@ class RolloutImitationConfig(
         return [f"imitation of {teacher.name}{known}"]
 
 
-class RolloutImitation:
+class RolloutImitation(SupervisedLearner):
     """Learns what choices cost least.
 
     Args:
@@ -86,25 +70,15 @@ class RolloutImitation:
         config: see RolloutImitationConfig.
     """
 
+    figures = ("regret", "entropy")
+
     def __init__(self, policy: PolicyNetwork, config: RolloutImitationConfig) -> None:
-        self.policy, self._config = policy, config
-        self.modules: dict[str, nn.Module] = {"policy": policy}
-        self.optimizer = torch.optim.Adam(policy.parameters(), fused=True)
+        super().__init__(policy, config)
+        self._config = config
 
     def learn(self, rollout: Rollout, progress: float, rng: np.random.Generator) -> dict[str, float]:
         """Take gradient steps on the turns that are kept."""
-        config, device = self._config, device_of(self.policy)
-        samples = self._samples(rollout, rng)
-        on_device = samples.to(device)
-        temperature = between(config.temperature, config.final_temperature, progress)
-        for group in self.optimizer.param_groups:
-            group["lr"] = between(config.learning_rate, config.final_learning_rate, progress)
-        reports = [
-            self._step(on_device[indices.to(device)], temperature)
-            for indices in minibatches(samples, config.minibatch, config.epochs, rng)
-        ]
-        names = ("policy_loss", "regret", "entropy", "gradient")
-        return dict(zip(names, means(reports), strict=True))
+        return self.fit(self._samples(rollout, rng), progress, rng)
 
     def _samples(self, rollout: Rollout, rng: np.random.Generator) -> TensorDict:
         samples, names, (turn, row) = importance_subsample(
@@ -113,30 +87,15 @@ class RolloutImitation:
         samples["excess"] = excess_costs(rollout.data[COSTS][row, turn]).gather(1, names)
         return samples
 
-    def _step(self, batch: TensorDict, temperature: float) -> Tensor:
-        share = batch["weight"] / batch["weight"].sum()
-        log_probs = logits_of(self.policy, batch).log_softmax(-1)
+    def _losses(self, batch: TensorDict, log_probs: Tensor, progress: float) -> Tensor:
+        temperature = between(self._config.temperature, self._config.final_temperature, progress)
         if self._config.criterion == "cross_entropy":
-            losses = cross_entropy(log_probs, (-batch["excess"] / temperature).softmax(-1))
-        else:
-            losses = -expected_advantage(log_probs, -batch["excess"].clamp(max=WORST), temperature)
-        loss = share @ losses
-        self.optimizer.zero_grad()
-        loss.backward()
-        norm = nn.utils.clip_grad_norm_(self.policy.parameters(), self._config.max_grad_norm)
-        self.optimizer.step()
-        with torch.no_grad():
-            probs = log_probs.exp()
-            regret = share @ (probs * batch["excess"].clamp(max=WORST)).sum(-1)
-            entropy = share @ cross_entropy(log_probs, probs)
-            return torch.stack([loss, regret, entropy, norm])
+            return cross_entropy(log_probs, (-batch["excess"] / temperature).softmax(-1))
+        return -expected_advantage(log_probs, -batch["excess"].clamp(max=WORST), temperature)
 
-    def state(self) -> dict[str, float | None]:
-        """Nothing."""
-        return {}
-
-    def restore(self, state: dict[str, float | None]) -> None:
-        """Nothing."""
+    def _figures(self, batch: TensorDict, log_probs: Tensor) -> list[Tensor]:
+        probs = log_probs.exp()
+        return [(probs * batch["excess"].clamp(max=WORST)).sum(-1), cross_entropy(log_probs, probs)]
 
 
 def excess_costs(costs: Tensor) -> Tensor:

@@ -11,33 +11,24 @@ from typing import Annotated
 
 import numpy as np
 import torch
-from msgspec import Meta, Struct
+from msgspec import Meta
 from tensordict import TensorDict
-from torch import Tensor, nn
+from torch import Tensor
 
 from marl_sched.agents.networks.network import PolicyNetwork
-from marl_sched.train.algorithms.base import NAME, AlgorithmConfig, Setup
-from marl_sched.train.bounds import Count, NonNegative, Positive
+from marl_sched.train.algorithms.base import NAME, Setup
+from marl_sched.train.algorithms.supervised import SupervisedConfig, SupervisedLearner
+from marl_sched.train.bounds import Count
 from marl_sched.train.collect import Collector, EpisodeCollector, Rollout
-from marl_sched.train.device import device_of
 from marl_sched.train.learner import Learner
-from marl_sched.train.ppo import between, importance_subsample, means
-from marl_sched.train.sequences import logits_of, minibatches
+from marl_sched.train.ppo import importance_subsample
 
 
-class SelfLabellingConfig(
-    AlgorithmConfig, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field=NAME, tag="self_labelling"
-):
+class SelfLabellingConfig(SupervisedConfig, frozen=True, kw_only=True, tag_field=NAME, tag="self_labelling"):
     """The best of `episodes` episodes of each instance; the learning rate changes linearly."""
 
     instances: Count
     episodes: Annotated[int, Meta(ge=2)]
-    epochs: Count
-    minibatch: Count
-    learning_rate: Positive
-    final_learning_rate: NonNegative
-    max_grad_norm: Positive
-    min_keep_prob: Annotated[float, Meta(gt=0, le=1)]
 
     def build(self, setup: Setup) -> tuple[Collector, Learner]:
         """See AlgorithmConfig."""
@@ -45,7 +36,7 @@ class SelfLabellingConfig(
         return collector, SelfLabelling(setup.policy(collector.env), self)
 
 
-class SelfLabelling:
+class SelfLabelling(SupervisedLearner):
     """Learns the best of a policy's own episodes.
 
     Args:
@@ -53,17 +44,15 @@ class SelfLabelling:
         config: see SelfLabellingConfig.
     """
 
+    figures = ("entropy",)
+
     def __init__(self, policy: PolicyNetwork, config: SelfLabellingConfig) -> None:
-        self.policy, self._config = policy, config
-        self.modules: dict[str, nn.Module] = {"policy": policy}
-        self.optimizer = torch.optim.Adam(policy.parameters(), fused=True)
+        super().__init__(policy, config)
+        self._config = config
 
     def learn(self, rollout: Rollout, progress: float, rng: np.random.Generator) -> dict[str, float]:
         """Take gradient steps on the turns of the best episodes that are kept; none where no episode is best."""
-        config, device = self._config, device_of(self.policy)
-        rate = between(config.learning_rate, config.final_learning_rate, progress)
-        for group in self.optimizer.param_groups:
-            group["lr"] = rate
+        config = self._config
         returns = torch.where(rollout.valid, rollout.rewards, 0.0).sum(0).view(-1, config.episodes)
         best = best_episodes(returns)
         report = {
@@ -75,31 +64,13 @@ class SelfLabelling:
             return report
         samples, names, (turn, row) = importance_subsample(self.policy, rollout, labelled, config.min_keep_prob, rng)
         samples["label"] = (names == rollout.actions[turn, row][:, None]).int().argmax(1)
-        on_device = samples.to(device)
-        reports = [
-            self._step(on_device[indices.to(device)])
-            for indices in minibatches(samples, config.minibatch, config.epochs, rng)
-        ]
-        return report | dict(zip(("policy_loss", "entropy", "gradient"), means(reports), strict=True))
+        return report | self.fit(samples, progress, rng)
 
-    def _step(self, batch: TensorDict) -> Tensor:
-        share = batch["weight"] / batch["weight"].sum()
-        log_probs = logits_of(self.policy, batch).log_softmax(-1)
-        loss = -(share @ log_probs.gather(1, batch["label"][:, None]).squeeze(1))
-        self.optimizer.zero_grad()
-        loss.backward()
-        norm = nn.utils.clip_grad_norm_(self.policy.parameters(), self._config.max_grad_norm)
-        self.optimizer.step()
-        with torch.no_grad():
-            entropy = -(share @ (log_probs.exp() * log_probs).sum(-1))
-            return torch.stack([loss.detach(), entropy, norm])
+    def _losses(self, batch: TensorDict, log_probs: Tensor, progress: float) -> Tensor:
+        return -log_probs.gather(1, batch["label"][:, None]).squeeze(1)
 
-    def state(self) -> dict[str, float | None]:
-        """Nothing."""
-        return {}
-
-    def restore(self, state: dict[str, float | None]) -> None:
-        """Nothing."""
+    def _figures(self, batch: TensorDict, log_probs: Tensor) -> list[Tensor]:
+        return [-(log_probs.exp() * log_probs).sum(-1)]
 
 
 def best_episodes(returns: Tensor) -> Tensor:
