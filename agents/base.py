@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
@@ -28,6 +29,22 @@ class EpochPlayer(Protocol):
 
         Returns the sum over all decisions of the visible share of the deciding agent's graph, and their number.
         """
+
+
+@dataclass(frozen=True)
+class Worths:
+    """What the acting agents' actions are worth to a scheduler: float64 (B, n_actions), not finite where it takes none.
+
+    Attributes:
+        meaning: what the values are, in words.
+        better: whether higher or lower values are.
+        first: bool (B, n_actions), actions that go before all others whatever their value; None: there are none such.
+    """
+
+    values: np.ndarray
+    meaning: str
+    better: Literal["higher", "lower"] = "higher"
+    first: np.ndarray | None = None
 
 
 class Scheduler(ABC):
@@ -61,6 +78,10 @@ class Scheduler(ABC):
     @abstractmethod
     def decide(self, simulator: TurnSimulator) -> np.ndarray:
         """Actions int64 (B,) for the acting agents; rows that are over get 0."""
+
+    def worths(self, simulator: TurnSimulator) -> Worths | None:
+        """What it thinks of the acting agents' actions, for people; None for a scheduler that cannot tell."""
+        return None
 
     def epoch_player(self, simulator: TurnSimulator) -> EpochPlayer | None:
         """What plays this scheduler's decision epochs on a simulator, which it is started on, in compiled code.
@@ -114,6 +135,11 @@ class AdvantageScheduler(ObservationScheduler):
         0 for action 0, -inf for actions that are not legal or not worth considering.
         """
 
+    def worths(self, simulator: TurnSimulator) -> Worths:
+        """Its advantages."""
+        found = self.advantages(simulator.observe(simulator.acting))
+        return Worths(found, f"gain over doing nothing, by {self.name}")
+
 
 class CostScheduler(Scheduler):
     """A scheduler that works out what every choice would cost the team, so that a policy can learn from it."""
@@ -125,6 +151,10 @@ class CostScheduler(Scheduler):
         `legal` int8 (B, n_actions) are the acting agents' action masks under the simulator's view. Rows that are
         over hold anything.
         """
+
+    def worths(self, simulator: TurnSimulator) -> Worths:
+        """Its costs."""
+        return Worths(self.costs(simulator, simulator.legal()), f"cost of what follows, by {self.name}", "lower")
 
 
 def batched(observation: Mapping[str, Any]) -> dict[str, np.ndarray]:

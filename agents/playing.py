@@ -22,12 +22,17 @@ class Watcher(Protocol):
         """Called after decisions in compiled code: how many, and the sum of the visible shares of some of them."""
 
 
-def play(scheduler: Scheduler, simulator: TurnSimulator, watcher: Watcher | None = None) -> TurnSimulator:
-    """Play every env of a simulator from the start of its episode to the end; returns the simulator."""
+def play(
+    scheduler: Scheduler, simulator: TurnSimulator, watcher: Watcher | None = None, *, until: int | None = None
+) -> TurnSimulator:
+    """Play every env of a simulator from the start of its episode to the end; returns the simulator.
+
+    `until`: stop as soon as every env that is not over has come so far (`TurnSimulator.progress`) or farther.
+    """
     scheduler.start(simulator, np.ones(simulator.batch, np.bool_))
     player = scheduler.epoch_player(simulator)
     number = 0
-    while (simulator.acting >= 0).any():
+    while _goes_on(simulator, until):
         if player is not None:
             shares, decisions = player(EPOCHS_AT_ONCE)
             if watcher is not None:
@@ -38,3 +43,9 @@ def play(scheduler: Scheduler, simulator: TurnSimulator, watcher: Watcher | None
         simulator.step(scheduler.decide(simulator))
         number += 1
     return simulator
+
+
+def _goes_on(simulator: TurnSimulator, until: int | None) -> bool:
+    """Whether an env still plays that has not come as far as `until`."""
+    playing = simulator.acting >= 0
+    return bool(playing.any() if until is None else (playing & (simulator.progress < until)).any())

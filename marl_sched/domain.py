@@ -110,6 +110,63 @@ def _json_files(folder: Path) -> list[Path]:
     return sorted(folder.glob("*.json"))
 
 
+@dataclass(frozen=True)
+class Measure:
+    """Something that is measured in every unit of time: float64 (B, T), and how units are joined to a longer step."""
+
+    values: np.ndarray
+    joined: Literal["mean", "sum"]
+    better: Literal["higher", "lower"]
+
+
+class Advice(Protocol):
+    """What `marl-sched advise` tells of a domain.
+
+    Attributes:
+        step: what the time to come is told in, and how many of the domain's `unit` that is, such as ("day", 24).
+        steps: how many are told unless somebody asks for another number.
+        appraiser: the scheduler whose worths stand in for those of one that tells none.
+    """
+
+    step: tuple[str, int]
+    steps: int
+    appraiser: str
+
+    def choices(self, simulator: Any, env_index: int) -> list[tuple[str, dict[str, Any]]]:
+        """What every action of the acting agent is called, and what is known of it, in the order of actions."""
+
+    def outlook(self, simulator: Any) -> Mapping[str, Measure]:
+        """What happened in every unit of time so far, in all rows; the first measure is what futures are ranked by."""
+
+    def figure(self, episodes: Mapping[str, Any], until: int, env_index: int) -> Figure:
+        """One row of several simulators as a picture, caption -> simulator; needs matplotlib."""
+
+
+class Schedules(Protocol):
+    """The schedules of a domain whose episodes have rounds, each as plain data that is written as JSON."""
+
+    def of(self, simulator: Any, env_index: int, round_index: int) -> dict[str, Any]:
+        """The schedule of an ended round of a row."""
+
+    def decode(self, data: Any, where: str | Path) -> dict[str, Any]:
+        """The schedule in a file's data; InvalidFileError names `where` and the field."""
+
+    def problems(self, data: Mapping[str, Any]) -> list[str]:
+        """What an independent check finds wrong, a sentence each; empty if the schedule is confirmed and feasible."""
+
+    def explain(self, data: Mapping[str, Any]) -> list[str]:
+        """Why a schedule is infeasible, a sentence each; empty if it is feasible."""
+
+    def summary(self, data: Mapping[str, Any]) -> dict[str, Any]:
+        """What a table says of a schedule: name -> value."""
+
+    def rows(self, data: Mapping[str, Any]) -> tuple[list[str], list[list[Any]]]:
+        """Headings and rows of a spreadsheet of the schedule."""
+
+    def figure(self, schedules: Mapping[str, Mapping[str, Any]]) -> Figure:
+        """Charts of schedules by their captions, on one axis of time; needs matplotlib."""
+
+
 class Fitted(Protocol):
     """What was estimated from records."""
 
@@ -189,13 +246,19 @@ class Domain:
         instance_files: folder -> the files in it that should hold an instance each, sorted.
         save_schedules: (simulator, row, path without suffix) -> the files it wrote of a row's ended rounds, for an
             independent check; None: the domain has no such files.
+        schedules: what `marl-sched schedule` and `validate` need; None: its episodes have no schedules.
+        solver_bound: (instance, objective, time_limit) -> what a solver proves of the first round: `bound` (None where
+            nothing can be proved), `status`, `seconds`; None: there is no such solver.
         impossibilities: instance -> why no schedule of it can be feasible, a sentence each; empty if none is known.
+        advice: what `marl-sched advise` tells; None: nothing.
         sheet: how an instance stands in a spreadsheet; None: `marl-sched import` cannot read it.
         records: the spreadsheet of what `marl-sched fit` estimates parameters from; reading it gives a `Fitted`; None:
             there is nothing to fit.
         demo: what `marl-sched demo` shows; None: nothing.
         pressing: (metagraph, observation of it) -> the legal actions, bool (B, n_actions), one of which a greedy policy
             takes before it does nothing; None: there are none such.
+        episode_figure: (episodes, title=) -> a figure with a panel for each of the finished episodes, caption ->
+            simulator, all on one axis of time; None: the `rgb_array` pictures are put one above the other.
         legend: what the colours of the `rgb_array` picture mean, meaning -> RGB in 0 .. 255; None: it needs none.
         best_of: (trained policy, number of samples) -> a scheduler that follows the best of the policy's sampled
             schedules, `NAME@samples=K` for users; None: the domain has no such thing.
@@ -233,10 +296,14 @@ class Domain:
     impossibilities: Callable[[Any], list[str]] = _none_known
     instance_files: Callable[[Path], list[Path]] = _json_files
     save_schedules: Callable[[Any, int, Path], list[Path]] | None = None
+    schedules: Schedules | None = None
+    solver_bound: Callable[[Any, str, float | None], dict[str, Any]] | None = None
+    advice: Advice | None = None
     sheet: Sheet | None = None
     records: Sheet | None = None
     demo: Demo | None = None
     pressing: Callable[[GraphSpec, Mapping[str, np.ndarray]], np.ndarray] | None = None
+    episode_figure: Callable[..., Figure] | None = None
     legend: Mapping[str, Sequence[int]] | None = None
     band: tuple[str, int] | None = None
 

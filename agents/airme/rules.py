@@ -18,7 +18,7 @@ from marl_sched.agents.airme import ranking
 from marl_sched.agents.airme.bound.index import require_types
 from marl_sched.agents.airme.epochs import EpochPlayer
 from marl_sched.agents.airme.ranking import N_FEATURES, Ranking
-from marl_sched.agents.base import ObservationScheduler, best_action
+from marl_sched.agents.base import ObservationScheduler, Worths, best_action
 from marl_sched.envs.airme.aircraft import PUBLISHED_TYPES, AircraftType, FailureModel, failure_table
 from marl_sched.envs.airme.graph import PLANE
 from marl_sched.envs.airme.simulator import AirmeSimulator
@@ -47,6 +47,14 @@ class PriorityRule(ObservationScheduler):
         failure = self._failures(observation["plane"])
         ranks = ranking.rank_observation(observation, failure, self.ranking)
         return best_action(ranks, ranks > self.ranking.least)
+
+    def worths(self, simulator: TurnSimulator) -> Worths:
+        """Its ranks; broken planes, or worn ones, that go before all others are marked."""
+        observation = simulator.observe(simulator.acting)
+        ranks = ranking.rank_observation(observation, self._failures(observation["plane"]), self.ranking)
+        ranks = np.where(ranks > self.ranking.least, ranks, -np.inf)
+        first = ranks >= ranking.FIRST
+        return Worths(np.where(first, ranks - ranking.FIRST, ranks), f"what {self.name} ranks by", first=first)
 
     def epoch_player(self, simulator: TurnSimulator) -> EpochPlayer:
         """What plays this rule's decision epochs in one call."""

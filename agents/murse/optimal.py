@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TypedDict
+from typing import Any, TypedDict
 
 import numpy as np
 
@@ -145,3 +145,17 @@ def is_feasible(instance: MurseInstance, time_limit: float | None = None) -> boo
     problem = Round.of(instance)
     first = best_rule_plan(problem)
     return first.feasible or solve(problem, time_limit=time_limit).plan is not None
+
+
+def solver_bound(instance: MurseInstance, objective: str, time_limit: float | None = None) -> dict[str, Any]:
+    """What CP-SAT proves of the first round: `bound`, `status` and `seconds`.
+
+    Where humans' durations are drawn nothing can be proved of what happens: the bound is None, the status "uncertain
+    durations". Without a `time_limit` in seconds the solver works for WORK_LIMIT.
+    """
+    if instance.durations != "deterministic" and instance.n_humans:
+        return {"bound": None, "status": "uncertain durations", "seconds": 0.0}
+    problem = Round.of(instance)
+    found = solve(problem, objective=objective, time_limit=time_limit, start=best_rule_plan(problem, objective))
+    bound = None if np.isnan(found.bound) else found.bound
+    return {"bound": bound, "status": found.status, "seconds": found.seconds}

@@ -9,13 +9,14 @@ from marl_sched.agents.murse.dispatching import factories
 from marl_sched.agents.murse.genetic import GeneticEdf
 from marl_sched.agents.murse.lst import LeastLatestStart, LstSearch, RobustLst
 from marl_sched.agents.murse.negotiated import Cbba, Tessi, TessiSlack
-from marl_sched.agents.murse.optimal import ExactScheduler, RollingScheduler, is_feasible
+from marl_sched.agents.murse.optimal import ExactScheduler, RollingScheduler, is_feasible, solver_bound
 from marl_sched.agents.murse.published import EdfPublished, GeneticPublished
 from marl_sched.agents.murse.rollout import LatestStartRollout, LocalLst, RobustLocalLst, RobustRollout
 from marl_sched.agents.murse.rules import FirstClaim, RandomRule, edf, hctf
 from marl_sched.agents.murse.tercio import Tercio
 
 IS_FEASIBLE = is_feasible
+SOLVER_BOUND = solver_bound
 
 RULES: dict[str, Callable[..., Scheduler]] = {
     "random": RandomRule,

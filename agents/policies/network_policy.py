@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from marl_sched.agents.base import ObservationScheduler, Scheduler, inverse_distribution
+from marl_sched.agents.base import ObservationScheduler, Scheduler, Worths, inverse_distribution
 from marl_sched.agents.networks.batches import logits_in_blocks, recurred_in_blocks
 from marl_sched.agents.networks.network import PolicyNetwork, RecurrentNetwork
 from marl_sched.agents.policies.cards import Mode, PolicyCard, check_graph
@@ -184,6 +184,14 @@ class NetworkPolicy(TrainedPolicy, ObservationScheduler):
             self._first.logits[envs[new]] = self.logits({name: values[new] for name, values in observation.items()})
             self._first.time[envs] = simulator.time[envs]
         return np.where(legal, self._first.logits[envs], np.finfo(np.float32).min)
+
+    def worths(self, simulator: TurnSimulator) -> Worths:
+        """The probabilities with which it would take each action if it sampled."""
+        observation = simulator.observe(simulator.acting)
+        logits = self.logits(observation).astype(np.float64)
+        weights = np.exp(logits - logits.max(axis=1, keepdims=True))
+        shares = 100.0 * weights / weights.sum(axis=1, keepdims=True)
+        return Worths(np.where(observation[ACTION_MASK] > 0, shares, -np.inf), f"percent that {self.name} gives it")
 
     def choose(self, observation: Observation, uniform: np.ndarray) -> np.ndarray:
         """Actions int64 (B,) from batched observations and uniforms float64 (B,) in [0, 1)."""

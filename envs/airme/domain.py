@@ -43,8 +43,8 @@ AIRME = Domain(
         central_rules=("corrective", "condition", "model-based", "preventive-first"),
     ),
     pressing=pressing,
-    legend=render.LEGEND,
-    band=("plane", render.CELL),
+    episode_figure=lazy("marl_sched.envs.airme.timeline_figure:episode_figure"),
+    advice=lazy("marl_sched.envs.airme.advice:ADVICE"),
     sheet=lazy("marl_sched.envs.airme.sheet:FLEET"),
     records=lazy("marl_sched.envs.airme.fitting:RECORDS"),
 )

@@ -24,8 +24,6 @@ LEGEND = {
     "in repair": COLOURS[REPAIR],
     "broken and waiting": COLOURS[BROKEN],
 }
-CELL = 4  # pixels a plane is high
-_HOUR = 2  # pixels an hour is wide
 _BOARD_COLUMNS = 3
 
 
@@ -64,17 +62,19 @@ def _crew_cell(crew: np.void, index: int) -> str:
     return f"crew {index}: " + (f"plane {crew['plane']}" if crew["plane"] else "free")
 
 
-def timeline(simulator: AirmeSimulator, env_index: int = 0) -> np.ndarray:
-    """What every plane did in every hour so far, uint8 (height, width, 3): one band per plane, one column per hour.
-
-    Grey is grounded, blue flying, red broken and waiting, amber in repair. Raises InvalidOptionError if the
-    simulator was made without `record_timeline`.
-    """
+def require_timeline(simulator: AirmeSimulator) -> None:
+    """InvalidOptionError if a simulator did not record what its planes did."""
     if not len(simulator.state.timeline):
         raise InvalidOptionError("render: the simulator was made without record_timeline=True")
-    hours, n_planes = max(int(simulator.time[env_index]), 1), simulator.state.rows["n_planes"][env_index]
-    status = simulator.state.timeline[env_index, :hours, 1 : n_planes + 1].T
-    palette = np.array([COLOURS[k] for k in sorted(COLOURS)], np.uint8)
-    image = palette[status].repeat(CELL, axis=0).repeat(_HOUR, axis=1)
-    image[CELL - 1 :: CELL] = 255
-    return image
+
+
+def timeline(simulator: AirmeSimulator, env_index: int = 0) -> np.ndarray:
+    """What every plane and crew did so far, with labels, uint8 (540, 960, 3): every picture of an episode alike.
+
+    Needs matplotlib, see marl_sched.envs.airme.timeline_figure. Raises InvalidOptionError if the simulator was made
+    without `record_timeline`.
+    """
+    require_timeline(simulator)
+    from marl_sched.envs.airme.timeline_figure import frame
+
+    return frame(simulator, env_index)

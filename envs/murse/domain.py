@@ -39,6 +39,10 @@ MURSE = Domain(
     generate_accepted=generate,
     impossibilities=MurseInstance.impossibilities,
     instance_files=instance_files,
+    episode_figure=lazy("marl_sched.envs.murse.render:episode_figure"),
     save_schedules=lazy("marl_sched.envs.murse.schedule:save_schedules"),
+    schedules=lazy("marl_sched.envs.murse.schedule_files:SCHEDULES"),
+    solver_bound=lazy("marl_sched.agents.murse.schedulers:SOLVER_BOUND"),
+    advice=lazy("marl_sched.envs.murse.advice:ADVICE"),
     sheet=lazy("marl_sched.envs.murse.sheet:TASKS"),
 )

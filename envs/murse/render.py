@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from marl_sched.envs.murse.colours import HUMAN, ROBOT, WAIT
 from marl_sched.envs.murse.schedule import schedule
 from marl_sched.envs.murse.state import NOBODY
-from marl_sched.envs.murse.validation import validate
 from marl_sched.files import replacing
 
 if TYPE_CHECKING:
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
     from marl_sched.envs.murse.simulator import MurseSimulator
 
-ROBOT, HUMAN, LATE, WAIT = "#56a0d3", "#f4b040", "#cb4335", "#7f8c8d"
+FRAME = (9.6, 5.4)  # inches of every picture of an episode, at 100 dots each
 
 
 def board(simulator: MurseSimulator, env_index: int = 0) -> str:
@@ -37,73 +38,78 @@ def board(simulator: MurseSimulator, env_index: int = 0) -> str:
 
 
 def gantt(simulator: MurseSimulator, env_index: int = 0) -> np.ndarray:
-    """The Gantt chart of the last ended round as an image, uint8 (height, width, 3).
+    """The Gantt chart of the last ended round, uint8 (540, 960, 3); before a round has ended the map, of that size too.
 
-    Before a round has ended it shows the map. Raises ModuleNotFoundError without matplotlib.
+    Raises ModuleNotFoundError without matplotlib.
     """
     if simulator.state.rows["round"][env_index] == 0:
         return _image(map_figure(simulator, env_index))
-    return _image(gantt_figure(schedule(simulator, env_index)))
+    from marl_sched.envs.murse.gantt import gantt_figure
+
+    return _image(gantt_figure({"": schedule(simulator, env_index)}, FRAME))
 
 
-def gantt_figure(data: dict[str, Any]) -> Figure:
-    """The Gantt chart of a schedule's data: agents as rows, deadlines as lines, waits as arrows, violations red."""
-    figure, axes = _figure(9.0, 1.2 + 0.5 * len(data["agents"]))
-    rows = {job["task"]: job for job in data["dispatch"]}
-    late = {task for task in rows if _is_late(data, rows[task])}
-    for task, job in rows.items():
-        colour = ROBOT if data["agents"][job["agent"]].startswith("robot") else HUMAN
-        edge = LATE if task in late else "white"
-        axes.barh(job["agent"], job["duration"], left=job["start"], color=colour, edgecolor=edge, linewidth=2)
-        axes.text(job["start"] + job["duration"] / 2, job["agent"], str(task), ha="center", va="center", fontsize=8)
-    for task, job in rows.items():
-        deadline = data["tasks"][task - 1]["deadline"]
-        if deadline is not None:
-            low, high = job["agent"] - 0.45, job["agent"] + 0.45
-            axes.plot([deadline, deadline], [low, high], color=LATE if task in late else "black", linewidth=1.5)
-            axes.text(deadline, low, f"{task}", fontsize=7, ha="center", va="bottom")
-        for wait in data["tasks"][task - 1]["waits"]:
-            if wait["after"] in rows:
-                before = rows[wait["after"]]
-                axes.annotate(
-                    "",
-                    xy=(job["start"], job["agent"]),
-                    xytext=(before["finish"], before["agent"]),
-                    arrowprops={"arrowstyle": "->", "color": WAIT, "linestyle": "dashed"},
-                )
-    verdict = "feasible" if data["feasible"] else "infeasible: " + "; ".join(validate(data).given_broken[:2])
-    axes.set_title(f"round {data['round'] + 1}, makespan {data['makespan']}, {verdict}"[:110], fontsize=9)
-    axes.set_yticks(range(len(data["agents"])), data["agents"])
-    axes.invert_yaxis()
-    axes.set_xlabel("time")
+def episode_figure(episodes: Mapping[str, MurseSimulator], *, title: str = "", until: int | None = None) -> Figure:
+    """The last round of several finished episodes, caption -> simulator, on one axis of time.
+
+    `until`: the round to draw, counted from 1; None: the last.
+    """
+    from marl_sched.envs.murse.gantt import gantt_figure
+
+    chosen = None if until is None else until - 1
+    figure = gantt_figure({caption: schedule(simulator, 0, chosen) for caption, simulator in episodes.items()})
+    if title:
+        figure.suptitle(title, fontsize=11, x=0.01, ha="left")
     return figure
 
 
-def _is_late(data: dict[str, Any], job: dict[str, Any]) -> bool:
-    deadline = data["tasks"][job["task"] - 1]["deadline"]
-    return deadline is not None and job["finish"] > deadline
-
-
 def map_figure(simulator: MurseSimulator, env_index: int = 0) -> Figure:
-    """Where the tasks are and where the agents stand; tasks nearer than the safety distance are joined."""
+    """Where the tasks are and where the agents stand; tasks nearer than the safety distance are joined.
+
+    Tasks that share a place, or lie so close that their numbers would overlap, have one label beside them.
+    """
     state, instance = simulator.state, simulator.instances[env_index]
-    figure, axes = _figure(5.0, 5.0)
+    figure, axes = _figure(*FRAME)
     taken = state.tasks["agent"][env_index, : instance.n_tasks] != NOBODY
     for i, j in np.argwhere(np.triu(instance.near)):
         axes.plot(*instance.locations[[i, j]].T, color=WAIT, linewidth=0.5, zorder=1)
     x, y = instance.locations.T
-    axes.scatter(x, y, s=160, c=[WAIT if t else "white" for t in taken], edgecolors="black", zorder=2)
-    places: dict[tuple[float, float], list[str]] = {}
-    for i, (a, b) in enumerate(instance.locations):
-        places.setdefault((float(a), float(b)), []).append(str(i + 1))
-    for (a, b), names in places.items():
-        axes.text(a, b, ",".join(names), ha="center", va="center", fontsize=7, zorder=3)
+    axes.scatter(x, y, s=50, c=[WAIT if t else "white" for t in taken], edgecolors="black", zorder=2)
+    for (a, b), names in _labels(instance.locations).items():
+        axes.annotate(
+            names, (a, b), xytext=(5, 4), textcoords="offset points", fontsize=7, zorder=3,
+            bbox={"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 0.4},
+        )  # fmt: skip
     for agent, last in enumerate(state.agents["last_task"][env_index, : instance.n_agents]):
         stand = instance.locations[last] if last >= 0 else np.zeros(2)
         colour = ROBOT if agent < instance.n_robots else HUMAN
-        axes.scatter(stand[0] + 0.12 * (agent + 1), stand[1] - 0.2, s=40, c=colour, marker="s", zorder=4)
-    axes.set_title("tasks (grey: taken) and agents (blue robots, amber humans)", fontsize=8)
+        axes.scatter(*stand, s=0)  # an annotation alone does not widen the axes
+        axes.annotate(
+            str(agent), stand, xytext=(-6 - 11 * (agent % 12), -11 - 11 * (agent // 12)), textcoords="offset points",
+            fontsize=6, ha="center", va="center", bbox={"facecolor": colour, "edgecolor": "none", "pad": 1.6}, zorder=4,
+        )  # fmt: skip
+    axes.margins(0.08)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_title(
+        "map: tasks (grey: taken) and agents where they stand (blue robots, amber humans); lines: too close to overlap",
+        fontsize=8,
+    )
+    axes.set_xlabel("x", fontsize=8)
+    axes.set_ylabel("y", fontsize=8)
     return figure
+
+
+def _labels(locations: np.ndarray) -> dict[tuple[float, float], str]:
+    """Labels by their place: the tasks of a place, and of places within a fiftieth of the map, together."""
+    span = max(float(np.ptp(locations, axis=0).max()), 1e-9)
+    groups: list[tuple[np.ndarray, list[int]]] = []
+    for i, place in enumerate(locations):
+        near = next((tasks for where, tasks in groups if np.abs(where - place).max() <= span / 50), None)
+        if near is None:
+            groups.append((place, [i + 1]))
+        else:
+            near.append(i + 1)
+    return {(float(a), float(b)): ",".join(map(str, tasks)) for (a, b), tasks in groups}
 
 
 def save_figure(figure: Figure, path: str | Path) -> None:
@@ -113,15 +119,16 @@ def save_figure(figure: Figure, path: str | Path) -> None:
 
 
 def _figure(width: float, height: float) -> tuple[Figure, Any]:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
     return figure, figure.add_subplot()
 
 
 def _image(figure: Figure) -> np.ndarray:
-    canvas: Any = figure.canvas
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    figure.set_dpi(100)
+    canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[:, :, :3].copy()

@@ -33,18 +33,21 @@ def schedule(simulator: MurseSimulator, env_index: int = 0, round_index: int | N
     executed = simulator.state.executed[env_index, chosen, : instance.n_tasks]
     dispatched = [i for i in np.argsort(executed["position"], kind="stable") if executed["agent"][i] != NOBODY]
     ahead = instance.waits_by_task()
+    tasks, agents = instance.called
     names = ("agent", "start", "finish", *(("committed",) if simulator.mode == "online" else ()))
     return {
         "schema": SCHEMA,
         "env": "murse",
         "round": chosen,
         "mode": simulator.mode,
-        "agents": [f"robot {a}" if a < instance.n_robots else f"human {a}" for a in range(instance.n_agents)],
+        "agents": agents,
+        "robots": instance.n_robots,
         "proximity": instance.proximity,
         "safety_distance": float(instance.safety_distance),
         "longest": int(result["longest"]),
         "tasks": [
             {
+                **({"name": tasks[i]} if instance.task_names else {}),
                 "deadline": None if instance.deadlines[i] == NO_DEADLINE else int(instance.deadlines[i]),
                 "waits": [{"after": j + 1, "time": w} for j, w in ahead[i]],
                 "location": instance.locations[i].tolist(),

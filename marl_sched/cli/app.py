@@ -11,7 +11,20 @@ from typing import Annotated, Any
 
 import typer
 
-from marl_sched.cli import bound, chaos, demo, deployment, evaluation, information, pages, problems, sheets, training
+from marl_sched.cli import (
+    advice,
+    bound,
+    chaos,
+    demo,
+    deployment,
+    evaluation,
+    information,
+    pages,
+    problems,
+    schedules,
+    sheets,
+    training,
+)
 from marl_sched.errors import InvalidSheetError, MarlSchedError
 
 app = typer.Typer(
@@ -22,7 +35,10 @@ app = typer.Typer(
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
 )
-for group in (problems, sheets, evaluation, pages, bound, training, deployment, chaos, demo, information):
+_GROUPS = (
+    problems, sheets, advice, schedules, evaluation, pages, bound, training, deployment, chaos, demo, information,
+)  # fmt: skip
+for group in _GROUPS:
     group.add_to(app)
 
 # Newer typer ships click inside itself, older ones depend on it: the base of all its errors of usage is reached

@@ -48,14 +48,15 @@ def state_problem(
     env: str,
     own: OwnOptions,
     *,
-    instances: str | Path | None = None,
+    instances: str | Path | list[Any] | None = None,
     scale: str | None = None,
     view: str = "full",
     **arguments: Any,
 ) -> Problem:
     """The problem that words of the command line state.
 
-    `instances` is how many to generate, a folder of instance files or one file; None: one is generated.
+    `instances` is how many to generate, a folder of instance files or one file, or a list of instances; None: one is
+    generated.
     `own` holds the options that only this environment or this view has: the horizon by the name of its unit
     (`--hours 48`), the view's options, and the simulator's. Raises UnknownNameError for an option that nobody has.
     """
@@ -99,14 +100,14 @@ def as_value(text: str) -> Any:
     return {"true": True, "false": False, "null": None}.get(text, text)
 
 
-def _source(domain: Domain, instances: str | Path | None, scale: str | None) -> dict[str, Any]:
+def _source(domain: Domain, instances: str | Path | list[Any] | None, scale: str | None) -> dict[str, Any]:
     """The problem's instances: so many of a scale, or files, which are of no scale."""
     if scale is not None:
         domain.require_scale(scale)
     if instances is None:
         return {"scale": scale, "count": 1}
-    if isinstance(instances, Path):
-        return {"instances": [instances]}
+    if isinstance(instances, Path | list):
+        return {"instances": [instances] if isinstance(instances, Path) else instances}
     if instances.lstrip("-").isdigit():
         if int(instances) < 1:
             raise InvalidOptionError(f"--instances: expected at least 1, got {instances}")

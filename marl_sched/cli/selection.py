@@ -91,11 +91,13 @@ class Resolved:
     schedulers: dict[str, Scheduler]
 
 
-def create_schedulers(domain: Domain, names: Iterable[str], time_limit: float | None = None) -> dict[str, Scheduler]:
+def create_schedulers(
+    domain: Domain, names: Iterable[str], time_limit: float | None = None, *, strict: bool = True
+) -> dict[str, Scheduler]:
     """The schedulers by the words that were typed, in their order; InvalidOptionError if there is none.
 
     A word is a name and, each behind an `@`, options of that scheduler: `lst-search@evaluations=32`. `time_limit`
-    goes to those that have such an option and were not given another one; one of them must have it.
+    goes to those that have such an option and were not given another one; if `strict`, one of them must have it.
     """
     from marl_sched.agents.registry import create_scheduler
 
@@ -112,7 +114,7 @@ def create_schedulers(domain: Domain, names: Iterable[str], time_limit: float | 
             given.setdefault("time_limit", time_limit)
             limited += 1
         schedulers[word] = create_scheduler(name, domain, **given)
-    if time_limit is not None and not limited:
+    if strict and time_limit is not None and not limited:
         raise InvalidOptionError(f"--time-limit: none of {', '.join(typed)} has a limit")
     return schedulers
 

@@ -150,7 +150,7 @@ def print_rows(
     console = Console(stderr=stderr)
     table = Table(title=title or None, box=box.SIMPLE_HEAD, title_justify="left")
     for heading in headings:
-        table.add_column(heading, no_wrap=True)
+        table.add_column(escape(heading), no_wrap=True)
     for row in rows:
         table.add_row(*map(escape, row))
     widths = [max(map(len, cells)) for cells in zip(headings, *rows, strict=True)]

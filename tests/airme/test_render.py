@@ -7,6 +7,7 @@ import pytest
 
 from marl_sched.envs.airme.render import COLOURS, fleet_board, timeline
 from marl_sched.envs.airme.simulator import AirmeSimulator
+from marl_sched.envs.airme.timeline_figure import episode_figure, jobs
 from marl_sched.errors import InvalidOptionError
 from tests.airme.fleets import RESERVE, STEADY, fleet, plane, play
 
@@ -48,15 +49,31 @@ def test_board_shows_the_means_so_far(simulator: AirmeSimulator) -> None:
     assert "availability 0.500" in head
 
 
-def test_timeline_colours_what_each_plane_did(simulator: AirmeSimulator) -> None:
-    image = timeline(simulator)
-    assert image.dtype == np.uint8
-    hours, planes = 2, 4
-    height, width = image.shape[0] // planes, image.shape[1] // hours
-    assert image.shape == (height * planes, width * hours, 3)
-    grey, blue, red, amber = (COLOURS[k] for k in range(4))
-    seen = [[tuple(image[p * height, h * width]) for h in range(hours)] for p in range(planes)]
-    assert seen == [[blue] * 2, [red] * 2, [amber] * 2, [grey] * 2]
+def test_frames_are_alike_and_show_every_status_by_its_colour(simulator: AirmeSimulator) -> None:
+    first = timeline(simulator)
+    assert (first.shape, first.dtype) == ((540, 960, 3), np.uint8)
+    simulator.step(np.zeros(1, np.int64))
+    assert timeline(simulator).shape == first.shape
+    for colour in COLOURS.values():  # each also stands in the legend, so it is there more often than there
+        assert (first == colour).all(axis=2).sum() > 100
+
+
+def test_crews_jobs_are_told_from_the_planes_they_served() -> None:
+    assert jobs(np.array([3, 3, 0, 2, 4, 4])) == [(0, 2, 3), (3, 4, 2), (4, 6, 4)]
+    assert jobs(np.array([0, 0])) == []
+
+
+def test_who_served_which_plane_is_on_record(simulator: AirmeSimulator) -> None:
+    assert simulator.state.jobs[0, :2].tolist() == [[3, 0], [3, 0]]
+
+
+def test_episodes_share_their_axis_and_crews_have_rows(simulator: AirmeSimulator) -> None:
+    longer = AirmeSimulator([FLEET], record_timeline=True)
+    play(longer, [3, 0], [0, 0], [0, 0])
+    figure = episode_figure({"two hours": simulator, "three hours": longer})
+    assert {axes.get_xlim() for axes in figure.axes} == {(0.0, 3.0)}
+    crews = figure.axes[1]
+    assert [label.get_text() for label in crews.get_yticklabels()] == ["crew 0", "crew 1"]
 
 
 def test_timeline_that_was_not_recorded_raises() -> None:

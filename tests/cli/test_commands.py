@@ -13,8 +13,9 @@ from marl_sched.cli.app import app as application
 from marl_sched.domain import get_domain
 
 COMMANDS = [
-    "generate", "template", "import", "fit", "evaluate", "compare", "bench", "tables", "bound", "train", "resume",
-    "export", "curves", "world", "agent", "deploy", "replay", "demo", "list", "doctor",
+    "generate", "template", "import", "fit", "advise", "schedule", "validate", "evaluate", "compare", "bench", "tables",
+    "bound", "train", "resume", "export", "curves", "world", "agent", "deploy", "replay", "certs", "demo", "list",
+    "doctor",
 ]  # fmt: skip
 AIRME = get_domain("airme")
 SHORT = ("--instances", 2, "--episodes", 2, "--hours", 24, "--seed", 3)

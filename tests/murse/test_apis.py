@@ -9,6 +9,7 @@ from marl_sched import murse_v0
 from marl_sched.domain import get_domain
 from marl_sched.envs.api.gymnasium_env import SchedulingEnv
 from marl_sched.envs.murse import render
+from marl_sched.envs.murse.gantt import gantt_figure
 from marl_sched.envs.murse.schedule import schedule
 from marl_sched.envs.murse.simulator import MurseSimulator
 from marl_sched.errors import IllegalActionError, UnknownNameError
@@ -124,11 +125,13 @@ def test_pictures_are_images_and_the_gantt_chart_marks_violations(tmp_path):
     assert start.dtype == np.uint8
     assert start.shape[2] == 3
     played(simulator, [1, 2, 3])
-    figure = render.gantt_figure(schedule(simulator))
+    assert render.gantt(simulator).shape == start.shape == (540, 960, 3)  # videos take frames of one size alone
+    figure = gantt_figure({"": schedule(simulator)})
     axes = figure.axes[0]
-    assert "task 2: finishes at 7 after its deadline 6" in axes.get_title()
+    assert "task 2: finishes at 7 after its deadline 6" in axes.get_title(loc="left")
     assert [label.get_text() for label in axes.get_yticklabels()] == ["robot 0", "robot 1"]
-    bars = {int(text.get_text()): bar for text, bar in zip(axes.texts, axes.patches, strict=False)}
+    inside = [text for text in axes.texts if text.get_va() == "center"]
+    bars = {int(text.get_text()): bar for text, bar in zip(inside, axes.patches, strict=False)}
     assert [(bars[i].get_x(), bars[i].get_width()) for i in (1, 2, 3)] == [(0, 4), (4, 3), (9, 2)]
     late = [tuple(bar.get_edgecolor()) for bar in bars.values()]
     assert late[0] == late[2] != late[1]

@@ -33,17 +33,20 @@ def draw_scores(path: Path, *results: Results) -> Path:
 
 def draw_timelines(path: Path, domain: Domain, episodes: Mapping[str, TurnSimulator], objective: str) -> Path:
     """Finished episodes, caption -> what `play_episode` returned, one above the other as a picture; its path."""
-    panels = {}
-    for name, simulator in episodes.items():
-        score = simulator.objectives()[objective][0]
-        panels[f"{name}: {objective} {score:.3f}"] = domain.render["rgb_array"](simulator, 0)
+    captions = {
+        f"{name}: {objective} {simulator.objectives()[objective][0]:.3f}": simulator
+        for name, simulator in episodes.items()
+    }
+    title = "the same instance with the same noise"
+    if domain.episode_figure is not None:
+        return plots.save(domain.episode_figure(captions, title=title), path)
     figure = plots.timelines(
-        panels,
+        {caption: domain.render["rgb_array"](simulator, 0) for caption, simulator in captions.items()},
         length=max(int(simulator.time[0]) for simulator in episodes.values()),
         unit=next(iter(episodes.values())).time_unit,
         legend=domain.legend,
         band=domain.band,
-        title="the same instance with the same noise",
+        title=title,
     )
     return plots.save(figure, path)
 

@@ -54,9 +54,9 @@ def score_bars(*tables: Results) -> Figure:
     axes.errorbar(iqm, y, xerr=(iqm - low, high - iqm), fmt="none", ecolor=_INK, capsize=3, lw=1.3)
     axes.plot(means, y, "D", color=_INK, ms=4, mec="white", mew=0.6)
     right = max(0.0, high.max(), means.max())
-    for position, bound, mean in zip(y, high, means, strict=True):
+    for position, bound, mean, bar in zip(y, high, means, iqm, strict=True):
         axes.text(
-            max(bound, mean, 0.0) + 0.015 * right, float(position), f"{mean:.3f}", va="center", fontsize=9, color=_INK
+            max(bound, mean, 0.0) + 0.015 * right, float(position), f"{bar:.3f}", va="center", fontsize=9, color=_INK
         )
     axes.set_yticks(y, [name for name, _, _ in rows])
     axes.set_xlim(min(0.0, 1.05 * low.min()), 1.12 * right or 1.0)
@@ -73,7 +73,7 @@ def score_bars(*tables: Results) -> Figure:
             color=_INK,
             marker="|",
             ms=8,
-            label=f"95 % interval of the interquartile mean (bar), {kind} instances",
+            label=f"95 % interval of the interquartile mean (bar and number), {kind} instances",
         )
     )
     handles.append(Line2D([], [], color=_INK, marker="D", ms=4, ls="none", label="mean"))
@@ -188,8 +188,9 @@ def _plain(axes: Axes) -> None:
 def shares_against_scores(panels: Mapping[str, Mapping[str, Any]], *, measure: str = "M1") -> Figure:
     """M1 against the share of the graph that an agent sees: a panel per caption, a line per scheduler.
 
-    A panel is `{"bound": float, "central": (label, float), "lines": {label: [(share, score, stale), ...]}}`; points
-    of old data (`stale`) are open and stand beside the line. A scheduler has the same colour and shape everywhere;
+    A panel is `{"bound": float, "central": (label, float), "lines": {label: [(share, score, stale, half), ...]}}`;
+    `half` of the score's interval is drawn as a bar, points of old data (`stale`) are open and stand beside the line.
+    A scheduler has the same colour and shape everywhere;
     the bound and the score of the best scheduler that sees everything are level lines. As most of what matters lies
     close below the bound, the axis of scores is logarithmic in their distance to a level a little above it.
     """
@@ -200,10 +201,13 @@ def shares_against_scores(panels: Mapping[str, Mapping[str, Any]], *, measure: s
     for axes, (caption, panel) in zip(all_axes, panels.items(), strict=True):
         for label, points in panel["lines"].items():
             colour, marker = looks[label]
-            fresh = sorted((100 * share, score) for share, score, stale in points if not stale)
-            old = [(100 * share, score) for share, score, stale in points if stale]
-            for xy, look in ((fresh, {"ls": "-", "ms": 5}), (old, {"ls": "none", "ms": 6.5, "mfc": "white"})):
-                axes.plot([x for x, _ in xy], [y for _, y in xy], color=colour, marker=marker, lw=1.5, **look)
+            fresh = sorted((100 * share, score, half) for share, score, stale, half in points if not stale)
+            old = [(100 * share, score, half) for share, score, stale, half in points if stale]
+            for xyh, look in ((fresh, {"ls": "-", "ms": 5}), (old, {"ls": "none", "ms": 6.5, "mfc": "white"})):
+                x, y, half = np.array(xyh).reshape(-1, 3).T
+                axes.errorbar(
+                    x, y, yerr=half, color=colour, marker=marker, lw=1.5, elinewidth=0.8, capsize=2, **look
+                )  # fmt: skip
         name, best = panel["central"]
         axes.axhline(panel["bound"], color=_INK, lw=1.3)
         axes.axhline(best, color=_INK, lw=1.1, ls=":")
@@ -217,6 +221,7 @@ def shares_against_scores(panels: Mapping[str, Mapping[str, Any]], *, measure: s
     handles = [Line2D([], [], color=colour, marker=marker, label=label) for label, (colour, marker) in looks.items()]
     handles += [
         Line2D([], [], color=_INK, marker="o", mfc="white", ls="none", label="open: others' sectors seen late"),
+        Line2D([], [], color=_INK, marker="|", ms=9, ls="none", label="bars: 95 % of the mean over such instances"),
         Line2D([], [], color=_INK, lw=1.3, label="upper bound"),
         Line2D([], [], color=_INK, lw=1.1, ls=":", label="best that sees everything"),
     ]

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
+from scipy.special import stdtrit
 
 from marl_sched.train.evaluation.plots import shares_against_scores
 
@@ -18,7 +20,8 @@ def price_of_decentralisation(results: Mapping[str, Any]) -> Figure:
     for scale, found in section["scales"].items():
         lines = {
             line["label"]: [
-                (point["visible_share"], point["M1"]["mean"], stale[name]) for name, point in line["points"].items()
+                (point["visible_share"], point["M1"]["mean"], stale[name], _half(point["M1"], results["instances"]))
+                for name, point in line["points"].items()
             ]
             for line in found["lines"]
             if line["points"]
@@ -32,3 +35,8 @@ def price_of_decentralisation(results: Mapping[str, Any]) -> Figure:
             "lines": lines,
         }
     return shares_against_scores(panels, measure=f"M1 ({section['objective']})")
+
+
+def _half(score: Mapping[str, Any], n: int) -> float:
+    """Half of the 95 percent interval of a mean over n such instances (Student); 0 for one instance."""
+    return float(stdtrit(n - 1, 0.975) * score["std"] / np.sqrt(n)) if n > 1 else 0.0
