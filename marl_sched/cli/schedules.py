@@ -90,7 +90,7 @@ def _play(
     from marl_sched.train.evaluation.evaluate import own_options
 
     simulator = problem.simulator([0], **own_options(player, problem))
-    simulator.reset(seed=problem.seed, episodes=[0])
+    simulator.reset(seed=problem.seed, episodes=problem.episode_numbers([0]))
     started = time.perf_counter()
     play(player, simulator)
     seconds = time.perf_counter() - started

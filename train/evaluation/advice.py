@@ -56,7 +56,7 @@ def decide_now(problem: Problem, scheduler: Scheduler, appraiser: Scheduler, adv
     Worths are the scheduler's own; where it tells none, those of `appraiser`.
     """
     simulator = problem.simulator([0], **own_options(scheduler, problem))
-    simulator.reset(seed=problem.seed, episodes=[0])
+    simulator.reset(seed=problem.seed, episodes=problem.episode_numbers([0]))
     everywhere = np.ones(1, np.bool_)
     scheduler.start(simulator, everywhere)
     names = problem.domain.agent_names(problem.instances[0], int(simulator.n_agents[0]))
@@ -143,7 +143,7 @@ def play_futures(problem: Problem, scheduler: Scheduler, advice: Advice, *, coun
     per = advice.step[1]
     options = {**own_options(scheduler, problem), **problem.domain.render_options.get("rgb_array", {})}
     simulator = problem.simulator([0] * count, **options)
-    simulator.reset(seed=problem.seed, episodes=list(range(count)))
+    simulator.reset(seed=problem.seed, episodes=problem.episode_numbers(range(count)))
     play(scheduler, simulator, until=per * steps)
     totals, better = {}, {}
     for name, measure in advice.outlook(simulator).items():
