@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import io
+import os
 import sys
 import unicodedata
 from collections.abc import Sequence
@@ -60,6 +61,8 @@ _PLAIN = {
     "\u2501": "-",
 }
 
+INTERRUPTED = 130
+
 # The optional dependencies by the module that is missing without them.
 EXTRAS = {
     "torch": "train",
@@ -94,6 +97,7 @@ def root(
 def run(arguments: Sequence[str] | None = None) -> int:
     """Run one command; the exit code. See `marl_sched.cli.main`."""
     _print_anywhere()
+    os.environ.pop("MPLBACKEND", None)  # figures ask for no display, and a notebook's backend may not be installed here
     try:
         code = app(args=None if arguments is None else list(arguments), standalone_mode=False)
     except _UsageError as error:
@@ -113,7 +117,9 @@ def run(arguments: Sequence[str] | None = None) -> int:
         return _refuse(f"{error.filename}: {error.strerror}")
     except (KeyboardInterrupt, typer.Abort):
         print("interrupted", file=sys.stderr)
-        return 130
+        return INTERRUPTED
+    if code == INTERRUPTED:  # newer typer makes an exit code of the interrupt
+        print("interrupted", file=sys.stderr)
     return code if isinstance(code, int) else 0
 
 

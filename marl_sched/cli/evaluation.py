@@ -74,6 +74,7 @@ def compare(
     json: options.JsonFile = None,
     format: options.Format = "table",
     agents: Agents = False,
+    save_schedules: SaveSchedules = None,
     log: Annotated[
         list[Path] | None, typer.Option("--log", metavar="CSV", help="A training log to plot; may be repeated.")
     ] = None,
@@ -91,11 +92,13 @@ def compare(
     if json is not None and json.absolute() == out.absolute():
         raise InvalidOptionError(f"--json: {json} is the folder of --out, expected a file")
     require("format", format, FORMATS)
+    if save_schedules is not None:
+        options.check_folder(save_schedules, "--save-schedules")
     if log:  # first, as a log may be malformed
         better = get_domain(selection.env).better
         typer.echo(draw_learning_curves(out / "learning.png", log, better=better))
     resolved = selection.resolve()
-    results = play(resolved, selection.baseline)
+    results = play(resolved, selection.baseline, save_schedules)
     print_scores(results, format, stderr=json == STDOUT)
     if agents:
         print_agents(results, format, stderr=json == STDOUT)

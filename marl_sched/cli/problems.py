@@ -39,9 +39,8 @@ def generate(
     domain = _solvable(get_domain(env)) if feasible else get_domain(env)
     scale = domain.require_scale(scale or next(iter(domain.scales)))
     options.check_folder(out)
-    digits = len(str(count - 1))
     for i, instance in enumerate(domain.instances(scale, count, seed)):
-        path = out / f"{env}-{scale}-{seed}-{i:0{digits}}.json"
+        path = out / f"{env}-{scale}-{seed}-{i:04}.json"  # as long whatever the count, or a second call would leave twins
         instance.save(path)
         options.warn_of_impossible(domain, {path.name: instance})
     typer.echo(f"{count} {scale} {env} instances in {out}")

@@ -98,7 +98,7 @@ def test_doctor_says_how_to_get_what_is_missing(run, monkeypatch):
 def test_generated_files_hold_the_instances_of_the_seed(run, tmp_path):
     assert run("generate", "airme", "--scale", "medium", "--count", 2, "--seed", 5, "--out", tmp_path / "p").code == 0
     paths = sorted((tmp_path / "p").iterdir())
-    assert [path.name for path in paths] == ["airme-medium-5-0.json", "airme-medium-5-1.json"]
+    assert [path.name for path in paths] == ["airme-medium-5-0000.json", "airme-medium-5-0001.json"]
     expected = [instance.identity for instance in AIRME.instances("medium", 2, 5)]
     assert [AIRME.load(path).identity for path in paths] == expected
 
@@ -106,8 +106,8 @@ def test_generated_files_hold_the_instances_of_the_seed(run, tmp_path):
 def test_an_instance_does_not_depend_on_how_many_are_drawn(run, tmp_path):
     run("generate", "airme", "--count", 1, "--seed", 5, "--out", tmp_path / "one")
     run("generate", "airme", "--count", 12, "--seed", 5, "--out", tmp_path / "many")
-    first = (tmp_path / "one" / "airme-small-5-0.json").read_bytes()
-    assert (tmp_path / "many" / "airme-small-5-00.json").read_bytes() == first
+    first = (tmp_path / "one" / "airme-small-5-0000.json").read_bytes()
+    assert (tmp_path / "many" / "airme-small-5-0000.json").read_bytes() == first
 
 
 def test_evaluate_writes_the_same_results_for_the_same_seed(run, tmp_path):
@@ -193,7 +193,8 @@ def test_an_interrupted_command_ends_with_130(run, monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("marl_sched.domain.get_domain", interrupt)
-    assert run("evaluate", "--schedulers", "condition").code == 130
+    ended = run("evaluate", "--schedulers", "condition")
+    assert (ended.code, ended.err) == (130, "interrupted\n")
 
 
 def test_a_defect_keeps_its_traceback(monkeypatch):

@@ -51,5 +51,5 @@ def test_a_file_that_is_no_schedule_and_an_environment_without_any_are_refused(r
     ended = run("validate", tmp_path / "a.json")
     assert (ended.code, "a.json: round: expected an integer >= 0; the field is missing" in ended.err) == (2, True)
     run("generate", "airme", "--out", tmp_path / "p")
-    ended = run("schedule", tmp_path / "p" / "airme-small-0-0.json", "--scheduler", "condition")
+    ended = run("schedule", tmp_path / "p" / "airme-small-0-0000.json", "--scheduler", "condition")
     assert (ended.code, "the environment 'airme' has no schedules" in ended.err) == (2, True)

@@ -16,7 +16,8 @@ SHELL = re.compile(r"```sh\n(.*?)```", re.DOTALL)
 SECTIONS = {
     "fleet": ("A fleet", "Your own aircraft types", ["fleet.json", "advice.html", "advice.json"]),
     "types": ("Your own aircraft types", "Tasks of a plant", ["types.json", "fit.png", "own.json"]),
-    "plant": ("Tasks of a plant", None, ["out/lst.json", "out/gantt.svg", "out/schedule.html"]),
+    "plant": ("Tasks of a plant", "What the team", ["out/lst.json", "out/gantt.svg", "out/schedule.html"]),
+    "team": ("What the team should do now", None, []),
 }
 
 
@@ -24,12 +25,12 @@ SECTIONS = {
 def test_every_command_of_the_page_runs(section, tmp_path, monkeypatch, capsys):
     pytest.importorskip("ortools")
     first, behind, written = SECTIONS[section]
-    text = PAGE.split(f"## {first}\n")[1].split(f"## {behind}\n")[0]
+    text = PAGE.split(f"\n## {first}\n")[1].split(f"\n## {behind}")[0]
     monkeypatch.chdir(tmp_path)
     for name, content in FILE.findall(text):
         Path(name).write_text(content, encoding="utf-8")
     commands = [line for block in SHELL.findall(text) for line in block.splitlines()]
-    assert len(commands) >= 2
+    assert commands
     for line in commands:
         program, *words = shlex.split(line)
         assert program == "marl-sched"
