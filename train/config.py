@@ -16,6 +16,7 @@ from typing import Annotated, Any
 import msgspec
 from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from msgspec import Meta
 from omegaconf import OmegaConf
@@ -168,7 +169,7 @@ def load_config(overrides: Sequence[str]) -> TrainConfig:
     offer(chosen_domain(overrides))
     try:
         with initialize_config_module("marl_sched.configs", version_base="1.3"):
-            composed = OmegaConf.to_container(compose("train", list(overrides)), resolve=True)
+            composed = OmegaConf.to_container(compose("train", [_quoted(one) for one in overrides]), resolve=True)
     except (HydraException, OmegaConfBaseException) as error:
         raise InvalidOptionError(f"train: {_one_line(error)}") from error
     _refuse_renamed_in(composed)
@@ -177,6 +178,26 @@ def load_config(overrides: Sequence[str]) -> TrainConfig:
     except msgspec.ValidationError as error:
         raise InvalidOptionError(f"train: {error}") from error
     return _checked(config)
+
+
+def _quoted(override: str) -> str:
+    """An override as Hydra's grammar takes it: a value with `=`, `#`, umlauts and the like is put into quotes.
+
+    Raises InvalidOptionError for what is no override, and for several values where one is meant.
+    """
+    parser = OverridesParser.create()
+    name, equals, value = override.partition("=")
+    escaped = value.replace("\\", "\\\\").replace('"', '\\"')
+    for words in (override, f'{name}="{escaped}"'):
+        try:
+            parsed = parser.parse_override(words)
+        except HydraException:
+            continue
+        if parsed.is_sweep_override():
+            raise InvalidOptionError(f"train: {override}: expected one value; start a run for each of {value}")
+        return words
+    expected = "NAME=VALUE" if not equals else "a name of the configuration before ="
+    raise InvalidOptionError(f"train: {override}: expected {expected}")
 
 
 def load_record(path: Path) -> RunRecord:

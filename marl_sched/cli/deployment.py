@@ -64,7 +64,12 @@ class Plant:
     scale: options.Scale = None
     instance: Annotated[
         Path | None,
-        typer.Option("--instance", "--instances", metavar="FILE", help="An instance file (default: the first that the seed draws)."),
+        typer.Option(
+            "--instance",
+            "--instances",
+            metavar="FILE",
+            help="An instance file (default: the first that the seed draws).",
+        ),
     ] = None
     seed: options.Seed = 0
     objective: options.Objective = None

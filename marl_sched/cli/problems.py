@@ -40,7 +40,9 @@ def generate(
     scale = domain.require_scale(scale or next(iter(domain.scales)))
     options.check_folder(out)
     for i, instance in enumerate(domain.instances(scale, count, seed)):
-        path = out / f"{env}-{scale}-{seed}-{i:04}.json"  # as long whatever the count, or a second call would leave twins
+        path = (
+            out / f"{env}-{scale}-{seed}-{i:04}.json"
+        )  # as long whatever the count, or a second call would leave twins
         instance.save(path)
         options.warn_of_impossible(domain, {path.name: instance})
     typer.echo(f"{count} {scale} {env} instances in {out}")

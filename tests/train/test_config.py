@@ -105,3 +105,13 @@ def test_a_record_with_an_old_option_name_is_refused_with_the_new_one(tmp_path: 
     write_json(tmp_path / "config.json", record)
     with pytest.raises(InvalidFileError, match=r"config\.algorithm\.trace was renamed: expected .*gae_lambda"):
         load_record(tmp_path / "config.json")
+
+
+@pytest.mark.parametrize("folder", ["runs/a=b", "runs/für", "runs/a#b", 'runs/a "b"', "runs/back\\slash"])
+def test_values_that_hydra_has_other_uses_for_need_no_quotes(folder):
+    assert load_config([f"run_dir={folder}"]).run_dir == folder
+
+
+def test_several_values_where_one_is_meant_are_refused():
+    with pytest.raises(InvalidOptionError, match=r"^train: seed=0,1: expected one value; start a run for each of 0,1"):
+        load_config(["seed=0,1"])
