@@ -231,6 +231,10 @@ class Domain:
         default_horizon: simulated time of an episode.
         unit: what the simulated time of an episode counts, in the plural, as results and tables name it.
         better: whether a scheduler with a higher or a lower M1 is the better one.
+        headline: measures without which M1 says little, such as the share of feasible rounds; tables show them first.
+        objective_words: what an objective is, where its name alone misleads: name -> words for titles.
+        longest: instance -> the most units of time that an episode of it has, where instances limit it; None: they do
+            not. A longer horizon is refused where somebody asks for it.
         telemetry: how the state travels to deployed agents; None: the domain cannot be deployed.
         reference: name of the scheduler over which M2 is the gain; None: results have no M2.
         schedulers: scheduler's name -> factory, or `package.module:attribute` of such a table; more may be added by
@@ -280,6 +284,9 @@ class Domain:
     central: CentralInterface
     render: Mapping[str, Callable[[Any, int], Any]]
     default_horizon: int
+    headline: tuple[str, ...] = ()
+    objective_words: Mapping[str, str] = field(default_factory=dict)
+    longest: Callable[[Any], int] | None = None
     telemetry: Telemetry | None = None
     render_options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     unit: str = "hours"
@@ -314,6 +321,10 @@ class Domain:
     def __reduce_ex__(self, protocol: Any) -> Any:
         """Pickled by name where it is registered, since it holds functions that cannot be pickled."""
         return (get_domain, (self.name,)) if _DOMAINS.get(self.name) is self else super().__reduce_ex__(protocol)
+
+    def in_words(self, objective: str, length: str) -> str:
+        """What M1 is, for titles: `mean profit over 720 hours; higher is better`."""
+        return f"mean {self.objective_words.get(objective, objective)} over {length}; {self.better} is better"
 
     def agent_name(self, agent: int) -> str:
         """`crew_3` for agent 3 of a domain whose agents are crews."""

@@ -32,6 +32,12 @@ MURSE = Domain(
     default_horizon=DEFAULT_HORIZON,
     unit="rounds",
     better="lower",
+    headline=("feasible", "makespan_feasible"),
+    objective_words={
+        "makespan": "makespan, infeasible rounds at their worst case",
+        "weighted": "weighted completion time, infeasible rounds at their worst case",
+    },
+    longest=lambda instance: instance.n_rounds,
     schedulers="marl_sched.agents.murse.schedulers:RULES",
     best_of=lazy("marl_sched.agents.murse.sampling:BestOfSamples"),
     feasible=lazy("marl_sched.agents.murse.schedulers:IS_FEASIBLE"),

@@ -80,7 +80,12 @@ def state_problem(
             names = [f"--{one.replace('_', '-')}" for one in known]
             raise UnknownNameError(f"option of {env} with view {view}", f"--{option}", [*names, *own.command])
     source = _source(domain, instances, scale)
-    return Problem(domain, **source, horizon=horizon, view=view_words, options=options, **arguments)
+    problem = Problem(domain, **source, horizon=horizon, view=view_words, options=options, **arguments)
+    if horizon is not None and domain.longest is not None:
+        longest = max(map(domain.longest, problem.instances))
+        if horizon > longest:
+            raise InvalidOptionError(f"--{domain.unit} {horizon}: the instances have {longest} {domain.unit} at most")
+    return problem
 
 
 def _as_horizon(option: str, text: str) -> int:

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from marl_sched.train.bench import Bench
 
 _WIDE = 110  # columns of a terminal
-_ALWAYS = ("feasible",)  # without which M1 says little
 _OF_SOLVERS = ("bound", "optimal", "timed_out", "without_plan")  # told by round, without a spread over instances
 _NAME_WIDTH = 24  # columns for a scheduler's name and what is said of it
 _SHORTEST_NAME = 12  # columns that a name keeps on a narrow terminal
@@ -55,7 +54,8 @@ def print_scores(results: Results, style: str = "table", *, stderr: bool = False
         return
     measures = _other_measures(results)
     lines = [
-        [" ".join(cell.splitlines()) for cell in (name, *_cells(row, measures))] for name, row in results.best_first
+        [" ".join(cell.splitlines()) for cell in (name, *_cells(results, row, measures))]
+        for name, row in results.best_first
     ]
     kind = {"markdown": "github", "latex": "latex_booktabs"}[style]
     headings = ["scheduler", *_headings(results, measures)]
@@ -82,11 +82,14 @@ def _flat_row(results: Results, name: str, row: SchedulerResults) -> dict[str, A
 
 
 def _headings(results: Results, measures: list[str]) -> list[str]:
-    return ["M1", "IQM", "difference", *(["M2 %"] if results.reference is not None else []), *measures]
+    first = results.problem.domain.headline
+    gain = ["M2 %"] if results.reference is not None else []
+    return [*first, "M1", "IQM", "difference", *gain, *(name for name in measures if name not in first)]
 
 
-def _cells(row: SchedulerResults, measures: list[str]) -> list[str]:
+def _cells(results: Results, row: SchedulerResults, measures: list[str]) -> list[str]:
     """A scheduler's cells under `_headings`: a figure, and below it its spread or its intervals."""
+    first = results.problem.domain.headline
     m1, difference = row.M1, row.difference
     cells = [
         f"{_number(m1.mean, 4)}\n{_spread(m1.std)}",
@@ -95,11 +98,12 @@ def _cells(row: SchedulerResults, measures: list[str]) -> list[str]:
     ]
     if row.M2 is not None:
         cells.append(f"{row.M2.mean:.1f}\n{_spread(row.M2.std, 1)}")
-    return cells + [_cell(row.figures.get(measure)) for measure in measures]
+    before = [_cell(row.figures.get(measure)) for measure in first]
+    return [*before, *cells, *(_cell(row.figures.get(measure)) for measure in measures if measure not in first)]
 
 
 def _print_table(results: Results, console: Console) -> None:
-    measures = [name for name in _other_measures(results) if console.width >= _WIDE or name in _ALWAYS]
+    measures = [name for name in _other_measures(results) if console.width >= _WIDE]
     table = Table(title=_title(results.problem), caption=_caption(results), show_lines=False, box=box.SIMPLE_HEAD)
     table.add_column("scheduler", overflow="ellipsis", min_width=_SHORTEST_NAME)
     headings = _headings(results, measures)
@@ -107,7 +111,7 @@ def _print_table(results: Results, console: Console) -> None:
         table.add_column(heading, justify="right", no_wrap=True)
     widths = [len(heading) for heading in headings]
     for name, row in results.best_first:
-        cells = _cells(row, measures)
+        cells = _cells(results, row, measures)
         widths = [max(w, *map(len, cell.splitlines())) for w, cell in zip(widths, cells, strict=True)]
         table.add_row("\n".join([name, *_notes(results, row)]), *cells)
     # Two spaces beside every column, one between columns, one at each side: where that is too wide, lines are longer
@@ -128,7 +132,8 @@ def _notes(results: Results, row: SchedulerResults) -> list[str]:
 
 def _title(problem: Problem) -> str:
     scale = problem.pad or "given"
-    return f"{problem.domain.name}, {scale} instances: M1 is mean {problem.objective} over {problem.length}"
+    words = problem.domain.in_words(problem.objective, problem.length)
+    return f"{problem.domain.name}, {scale} instances: M1 is {words}"
 
 
 def _caption(results: Results) -> str:

@@ -104,3 +104,19 @@ def test_a_time_limit_without_a_solver_and_unknown_options_of_schedulers_are_ref
     assert (ended.code, "--time-limit: none of spt has a limit" in ended.err) == (2, True)
     ended = run(*selection, "lst-search@evaluatons=3")
     assert (ended.code, "did you mean 'evaluations'" in ended.err) == (2, True)
+
+
+def test_the_table_begins_with_feasibility_and_says_what_its_makespan_is(run, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "140")
+    words = ("--env", "murse", "--instances", 1, "--episodes", 1, "--rounds", 1, "--schedulers", "lst")
+    lines = run("evaluate", *words).out.splitlines()
+    assert "M1 is mean makespan, infeasible rounds at their worst case over 1 rounds; lower is better" in lines[0]
+    headings = next(line for line in lines if "IQM" in line).split()
+    assert headings[:4] == ["scheduler", "feasible", "makespan_feasible", "M1"]
+
+
+def test_more_rounds_than_the_instances_have_are_refused(run, tmp_path):
+    (tmp_path / "shop.jsp").write_text("1 1\n0 3\n")
+    words = ("--env", "murse", "--instances", tmp_path / "shop.jsp", "--episodes", 1, "--schedulers", "lst")
+    ended = run("evaluate", *words, "--rounds", 2)
+    assert (ended.code, ended.err) == (2, "error: --rounds 2: the instances have 1 rounds at most\n")

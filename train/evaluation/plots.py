@@ -60,7 +60,7 @@ def score_bars(*tables: Results) -> Figure:
         )
     axes.set_yticks(y, [name for name, _, _ in rows])
     axes.set_xlim(min(0.0, 1.05 * low.min()), 1.12 * right or 1.0)
-    axes.set_xlabel(f"M1: mean {problem.objective} over {problem.length}")
+    axes.set_xlabel(f"M1: {problem.domain.in_words(problem.objective, problem.length)}")
     axes.set_title(_conditions(problem), fontsize=10, loc="left")
     _plain(axes)
     axes.grid(axis="x", color=_FAINT, lw=0.6)
