@@ -1,4 +1,4 @@
-"""What `marl-sched advise` tells of a fleet; see marl_sched.domain.Advice."""
+"""What `marl-sched advise` tells of a fleet; see marl_sched.planning.Advice."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from marl_sched.domain import Measure
 from marl_sched.envs.airme.dynamics import AVAILABILITY, PROFIT, REVENUE
+from marl_sched.planning import Measure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

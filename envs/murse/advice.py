@@ -1,13 +1,13 @@
-"""What `marl-sched advise` tells of a plant; see marl_sched.domain.Advice."""
+"""What `marl-sched advise` tells of a plant; see marl_sched.planning.Advice."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from marl_sched.domain import Measure
 from marl_sched.envs.murse.instance import NO_DEADLINE
 from marl_sched.envs.murse.schedule import schedule
+from marl_sched.planning import Measure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

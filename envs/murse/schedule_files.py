@@ -1,4 +1,4 @@
-"""Schedules of MuRSE as `marl-sched schedule` and `validate` take them; see marl_sched.domain.Schedules."""
+"""Schedules of MuRSE as `marl-sched schedule` and `validate` take them; see marl_sched.planning.Schedules."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class _Schedule(msgspec.Struct):
 
 
 class MurseSchedules:
-    """See marl_sched.domain.Schedules."""
+    """See marl_sched.planning.Schedules."""
 
     def of(self, simulator: MurseSimulator, env_index: int, round_index: int) -> dict[str, Any]:
         """The schedule of an ended round as plain data."""

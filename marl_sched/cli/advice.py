@@ -16,7 +16,8 @@ from marl_sched.errors import InvalidOptionError
 
 if TYPE_CHECKING:
     from marl_sched.agents.base import Scheduler
-    from marl_sched.domain import Advice, Domain
+    from marl_sched.domain import Domain
+    from marl_sched.planning import Advice
     from marl_sched.problem import Problem
     from marl_sched.train.evaluation.advice import Decision, Futures
 

@@ -16,7 +16,8 @@ from marl_sched.errors import InvalidFileError, InvalidOptionError, MarlSchedErr
 
 if TYPE_CHECKING:
     from marl_sched.agents.base import Scheduler
-    from marl_sched.domain import Domain, Schedules
+    from marl_sched.domain import Domain
+    from marl_sched.planning import Schedules
     from marl_sched.problem import Problem
 
 REFUTED = 1  # exit code of `validate` for a schedule that is infeasible or not what it says

@@ -87,8 +87,9 @@ def fit(
 ) -> None:
     """Estimate parameters from records of failures, with intervals; parts that have not failed yet count."""
     from marl_sched.cli.tables import print_rows
-    from marl_sched.domain import Fitted, get_domain
+    from marl_sched.domain import get_domain
     from marl_sched.files import write_json
+    from marl_sched.planning import Fitted
     from marl_sched.sheet_reading import read_sheet
 
     sheet = get_domain(env).records

@@ -5,7 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from marl_sched.domain import Measure, get_domain
+from marl_sched.domain import get_domain
+from marl_sched.planning import Measure
 from marl_sched.problem import Problem
 from marl_sched.train.evaluation.advice import _joined, compare_futures, play_futures
 from tests.cli.pages import assert_well_formed

@@ -14,7 +14,7 @@ import numpy as np
 
 from marl_sched.agents.base import Scheduler, Worths
 from marl_sched.agents.playing import play
-from marl_sched.domain import Advice, Measure
+from marl_sched.planning import Advice, Measure
 from marl_sched.problem import Problem
 from marl_sched.simulation import TurnSimulator
 from marl_sched.train.evaluation.evaluate import own_options

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from marl_sched.domain import Advice
+from marl_sched.planning import Advice
 from marl_sched.train.evaluation.bands import band_figure
 from marl_sched.train.evaluation.html_page import Page
 
