@@ -11,6 +11,7 @@ from typing import Protocol
 from marl_sched.comms.protocol import events as ev
 from marl_sched.comms.protocol import keys
 from marl_sched.comms.protocol import messages as wire
+from marl_sched.comms.protocol.question import Question
 from marl_sched.comms.protocol.rules import AgentRules
 from marl_sched.errors import InvalidMessageError
 
@@ -68,9 +69,7 @@ class AgentProtocol:
         self._turn: wire.Turn | None = None  # the one to answer, once the local state is up to date
         self._choosing: wire.Turn | None = None
         self._sent: wire.Decision | None = None
-        self._lives = self._question = 0
-        self._asked: tuple[str, wire.Message | None] | None = None
-        self._ask_at = self._answer_by = self._hello_at = math.inf
+        self._lives, self._question, self._hello_at = 0, Question(rules), math.inf
         self._join_by, self._refusal = now + rules.join, ""
         self._announced = ""
         self._heard_at = self._last = self.wake_at = now
@@ -85,7 +84,7 @@ class AgentProtocol:
         match event:
             case ev.Reopened():
                 self._reopened(now, out)
-            case ev.Answered(question, payload) if question == self._question and self._asked is not None:
+            case ev.Answered(question, payload) if question == self._question.number and self._question.key is not None:
                 self._answered(payload, now, out)
             case ev.Received():
                 self._hear(event, now, out)
@@ -117,10 +116,8 @@ class AgentProtocol:
         if self.state != AgentState.REOPENING and now - self._heard_at >= self.rules.silence:
             self._reopen(now, out)
             return
-        if now >= self._answer_by:
-            self._ask_at, self._answer_by = now, math.inf
-        if now >= self._ask_at and self._asked is not None:
-            self._put_question(now, out)
+        if (again := self._question.due(now)) is not None:
+            out.append(again)
         if now >= self._hello_at:
             self._speak(now, out)
 
@@ -129,7 +126,7 @@ class AgentProtocol:
             return math.inf
         join_by = math.inf if self.state == AgentState.SERVING else self._join_by
         silent_at = math.inf if self.state == AgentState.REOPENING else self._heard_at + self.rules.silence
-        return min(self._ask_at, self._answer_by, self._hello_at, join_by, silent_at)
+        return min(self._question.wake_at, self._hello_at, join_by, silent_at)
 
     def _speak(self, now: float, out: list[ev.Effect]) -> None:
         """Say hello until welcomed, then once a heartbeat that this agent lives."""
@@ -152,7 +149,8 @@ class AgentProtocol:
         if self.state == AgentState.SERVING:
             self._join_by = now + self.rules.join
         self.state = AgentState.REOPENING
-        self._asked, self._ask_at, self._answer_by, self._hello_at = None, math.inf, math.inf, math.inf
+        self._question.close()
+        self._hello_at = math.inf
         out.append(ev.Reopen())
 
     def _reopened(self, now: float, out: list[ev.Effect]) -> None:
@@ -166,24 +164,13 @@ class AgentProtocol:
             self._join_by = now + self.rules.join
         self.state, self._heard_at, self._hello_at = AgentState.SEEKING, now, math.inf
         self._turn = None
-        self._ask(keys.FRAME, None, now, out)
-
-    def _ask(self, key: str, message: wire.Message | None, now: float, out: list[ev.Effect]) -> None:
-        self._asked = (key, message)
-        self._put_question(now, out)
-
-    def _put_question(self, now: float, out: list[ev.Effect]) -> None:
-        if self._asked is not None:
-            self._question += 1
-            self._ask_at, self._answer_by = math.inf, now + self.rules.answer
-            out.append(ev.Ask(self._question, *self._asked))
+        out.append(self._question.ask(keys.FRAME, None, now))
 
     def _answered(self, payload: bytes | None, now: float, out: list[ev.Effect]) -> None:
-        self._answer_by = math.inf
         if payload is None:
-            self._ask_at = now + self.rules.retry
+            self._question.retry(now)
             return
-        key, _ = self._asked or ("", None)
+        key = self._question.key or ""
         kind: type[wire.Frame | wire.Snapshot] = wire.Frame if key == keys.FRAME else wire.Snapshot
         try:
             said: wire.Frame | wire.Snapshot = wire.decode(payload, kind)
@@ -196,9 +183,10 @@ class AgentProtocol:
                 reason = f"the world speaks another version of the protocol: {version}, this is {wire.VERSION}"
                 self._end(ev.End(ev.Ending.FAILED, reason), out)
                 return
-            self._ask_at = now + self.rules.retry
+            self._question.retry(now)
             return
-        self._asked, self._ask_at, self._heard_at = None, math.inf, now
+        self._question.close()
+        self._heard_at = now
         if isinstance(said, wire.Frame):
             self._meet(said, now, out)
         else:
@@ -222,7 +210,7 @@ class AgentProtocol:
 
     def _ask_snapshot(self, now: float, out: list[ev.Effect]) -> None:
         request = wire.SnapshotRequest(run=self._run, epoch=self._epoch, agent=self._agent)
-        self._ask(keys.snapshot(self._agent), request, now, out)
+        out.append(self._question.ask(keys.snapshot(self._agent), request, now))
 
     def _caught_up(self, snapshot: wire.Snapshot, now: float, out: list[ev.Effect]) -> None:
         self.counts["snapshots"] += 1
@@ -319,7 +307,7 @@ class AgentProtocol:
             return
         if last and news.sequence > last + MAX_JUMP:
             self.counts["implausible"] += 1
-            if self._asked is None and now >= self._seek_at:
+            if self._question.key is None and now >= self._seek_at:
                 self._seek_at = now + 1.0
                 self._ask_snapshot(now, out)
             return
@@ -355,7 +343,7 @@ class AgentProtocol:
     def _take(self, turn: wire.Turn, now: float, out: list[ev.Effect]) -> None:
         again = self._turn == turn
         self._turn = turn
-        if again and self._lacks(turn) and self._asked is None:
+        if again and self._lacks(turn) and self._question.key is None:
             self._ask_snapshot(now, out)
         else:
             self._decide(out)

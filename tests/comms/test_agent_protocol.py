@@ -61,7 +61,7 @@ class AgentDriver:
         return self.at(now, ev.Received(key, wire.encode(message)))
 
     def answer(self, now: float, message: wire.Message) -> list[ev.Effect]:
-        return self.at(now, ev.Answered(self.protocol._question, wire.encode(message)))
+        return self.at(now, ev.Answered(self.protocol._question.number, wire.encode(message)))
 
     def join(self, now: float, *, epoch: str = "e1", sequence: int = 1) -> None:
         self.answer(now, wire.Frame(**{**US, "epoch": epoch}, env="toy", agents=2, heartbeat=0.5, problem=b"f"))
