@@ -123,7 +123,10 @@ def _card_view(view: dict[str, Any]) -> str:
 
 
 def _card_scores(scores: dict[str, Any]) -> str:
-    known = [
-        f"{scale} {score['M1']:.4f}" for scale, score in scores.items() if isinstance(score, dict) and "M1" in score
-    ]
+    """M1 by scale; of a validation on several scales each of them."""
+    known = []
+    for name, score in scores.items():
+        m1 = score.get("M1") if isinstance(score, dict) else None
+        for part, value in m1.items() if isinstance(m1, dict) else [("", m1)]:
+            known += [] if value is None else [f"{name} {part}".strip() + f" {value:.4f}"]
     return "M1 " + ", ".join(known) if known else "no measured scores"
