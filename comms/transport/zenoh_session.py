@@ -17,6 +17,7 @@ import json
 import logging
 import re
 import socket
+import ssl
 import threading
 import time
 from collections import Counter
@@ -39,6 +40,7 @@ DEFAULT_LEASE = 1.0  # seconds of silence after which a link counts as dead
 QUEUE = 16  # batches that may wait on a link, the most that Zenoh takes
 DROP_AFTER_US = 2000  # for which a full link may hold up a message before it is dropped
 CONNECT_SLICE = 1.0  # seconds for which an attempt to connect may keep a process from hearing signals
+KNOCK, KNOCK_AGAIN = 10.0, 0.2  # seconds that a TLS handshake may take, and until the next
 MAX_QUERIES, MAX_ALIKE = 256, 4  # that wait for an answer, in all and by one key; more are dropped
 QUERY_TIMEOUT = 10.0
 CLOSE_S = 1.0  # for which a session may take to close
@@ -181,7 +183,7 @@ def hub(
     hears `channels[i]`. DeploymentError if the endpoint is in use, InvalidOptionError for `tls/` without a certificate
     or another protocol with one.
     """
-    check_endpoint("listen", endpoint)
+    _check_encryption(endpoint, identity)
     rules = open_rules(run, prefix) if identity is None else named_rules(run, prefix, channels)
     config = _config(endpoint, lease, identity, mode="peer", listen={"endpoints": [endpoint]}, access_control=rules)
 
@@ -203,19 +205,31 @@ def spoke(
 
     `identity` is the agent's certificate, which a `tls/` endpoint asks for; InvalidOptionError as for `hub`.
     """
-    check_endpoint("connect", endpoint)
+    _check_encryption(endpoint, identity)
 
     def connect() -> zenoh.Session:
         end = time.monotonic() + timeout
         while True:
-            session = _connect(endpoint, min(CONNECT_SLICE, end - time.monotonic()), lease, identity)
-            if not isinstance(session, zenoh.ZError):
-                return session
+            obstacle: Exception | None = None
+            if identity is not None:
+                obstacle = _knock(endpoint, min(KNOCK, max(end - time.monotonic(), 0.01)), identity)
+            if obstacle is None:
+                session = _connect(endpoint, min(CONNECT_SLICE, end - time.monotonic()), lease, identity)
+                if not isinstance(session, zenoh.ZError):
+                    return session
+                obstacle = session
+            else:
+                time.sleep(KNOCK_AGAIN)
             if time.monotonic() >= end:
-                why = _why(endpoint, session)
-                raise DeploymentError(f"no world at {endpoint} within {timeout:g} s: {why}") from session
+                why = _why(endpoint, obstacle)
+                raise DeploymentError(f"no world at {endpoint} within {timeout:g} s: {why}") from obstacle
 
     return ZenohTransport(run, connect)
+
+
+def _check_encryption(endpoint: str, identity: Identity | None) -> None:
+    if is_encrypted(endpoint) != (identity is not None):
+        raise InvalidOptionError(f"{endpoint}: {'needs certificates' if identity is None else 'takes no certificates'}")
 
 
 def _connect(endpoint: str, seconds: float, lease: float, identity: Identity | None) -> zenoh.Session | zenoh.ZError:
@@ -229,8 +243,29 @@ def _connect(endpoint: str, seconds: float, lease: float, identity: Identity | N
         return error
 
 
-def _why(endpoint: str, error: zenoh.ZError) -> str:
+def _knock(endpoint: str, seconds: float, identity: Identity) -> OSError | None:
+    """Shake hands with a TLS listener; what kept it from answering, None if it did. Signals are heard meanwhile.
+
+    A listener that was frozen looks at every connection that was given up, ten in a second, before it comes to one that
+    waits still. Zenoh's short attempts, one after the other, would keep agents out for ever; this one waits.
+    """
+    end = time.monotonic() + seconds
+    host, port = check_endpoint("connect", endpoint)
+    try:
+        context = ssl.create_default_context(cafile=identity.authority)
+        context.load_cert_chain(identity.certificate, identity.key)
+        with socket.create_connection((host, port), seconds) as raw:
+            raw.settimeout(max(end - time.monotonic(), 0.01))
+            context.wrap_socket(raw, server_hostname=host).close()
+    except OSError as error:
+        return error
+    return None
+
+
+def _why(endpoint: str, error: Exception) -> str:
     """Why a connection failed: what the system says of the endpoint, as Zenoh only says that it timed out."""
+    if not isinstance(error, zenoh.ZError):
+        return str(error)
     try:
         with socket.create_connection(check_endpoint("connect", endpoint), CONNECT_SLICE):
             return _plain(error)
@@ -250,8 +285,6 @@ def _config(endpoint: str, lease: float, identity: Identity | None, **sections: 
         "rx": {"max_message_size": 2 * MAX_PAYLOAD},
         "protocols": [endpoint.partition("/")[0]],
     }
-    if is_encrypted(endpoint) != (identity is not None):
-        raise InvalidOptionError(f"{endpoint}: {'needs certificates' if identity is None else 'takes no certificates'}")
     if identity is not None:
         link["tls"] = _certificates(identity, "listen" if "listen" in sections else "connect")
     whole: Mapping[str, Any] = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import uuid
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -132,6 +133,21 @@ def test_whoever_has_no_certificate_of_this_authority_is_not_let_in(run, tmp_pat
     ):
         with pytest.raises(DeploymentError, match="no world at"):
             connect()
+
+
+def test_agent_waits_with_one_connection_for_a_world_that_is_frozen(folder):
+    """A listener that is frozen is knocked at once in ten seconds, as it looks at ten connections a second later on."""
+    with socket.socket() as frozen:
+        frozen.bind(("127.0.0.1", 0))
+        frozen.listen(64)
+        endpoint = f"tls/127.0.0.1:{frozen.getsockname()[1]}"
+        with pytest.raises(DeploymentError, match=r"no world at .* within 2\.5 s: .*timed out"):
+            spoke("run", endpoint, 2.5, identity=Identity(folder, "crew_0"))
+        frozen.setblocking(False)
+        waiting = [frozen.accept()[0]]
+        with pytest.raises(BlockingIOError):
+            frozen.accept()
+        waiting[0].close()
 
 
 def test_agent_that_listens_in_the_worlds_place_is_not_believed(folder):
