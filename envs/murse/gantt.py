@@ -16,6 +16,7 @@ from marl_sched.envs.murse.validation import validate
 _INK = "#22303c"
 _ARROWS = 40  # tasks, from which on waits are not drawn
 _TICK_LABELS = 40  # tasks, from which on only missed deadlines have their number
+_LATER = 1.25  # of the last finish: deadlines up to there are drawn
 _WIDEST, _TALLEST = 40.0, 60.0  # inches of a figure
 
 
@@ -50,9 +51,12 @@ def gantt_figure(schedules: Mapping[str, dict[str, Any]], size: tuple[float, flo
 
 
 def _span(schedules: Mapping[str, dict[str, Any]]) -> int:
-    """The last finish of all schedules, at least 1."""
-    finishes = [job["finish"] for data in schedules.values() for job in data["dispatch"]]
-    return max([1, *finishes])
+    """The last finish of all schedules, at least 1, or a deadline that is not much later."""
+    last = max([1, *(job["finish"] for data in schedules.values() for job in data["dispatch"])])
+    deadlines = [
+        task["deadline"] for data in schedules.values() for task in data["tasks"] if task["deadline"] is not None
+    ]
+    return max([last, *(one for one in deadlines if one <= _LATER * last)])
 
 
 def _inches(data: Mapping[str, Any]) -> float:
@@ -103,7 +107,7 @@ def _bars(axes: Any, data: Mapping[str, Any], width: float, span: int) -> None:
 
 
 def _deadlines(axes: Any, data: Mapping[str, Any], span: int) -> None:
-    """A tick at each deadline up to the last finish, in its task's row; its number above it where there is room."""
+    """A tick at each deadline on the axis, in its task's row; its number above it where there is room."""
     for job in data["dispatch"]:
         deadline = data["tasks"][job["task"] - 1]["deadline"]
         if deadline is None or deadline > span:
