@@ -54,6 +54,8 @@ class Scheduler(ABC):
         name: as users type it.
         privileged_info: what it uses beyond the acting agent's observation; printed with every result.
         simulator_options: options of the simulator that belong to it, where a user does not choose others.
+        plans_on_estimates: whether it decides from nothing but what the team counts on and has committed to, so that an
+            agent that is told that can run it (LocalState.simulator). An ObservationScheduler needs no more anyway.
         heeds_objective: whether its choices may depend on the simulator's objective; if not, one episode gives its
             scores for every objective.
     """
@@ -61,6 +63,7 @@ class Scheduler(ABC):
     name: str
     privileged_info: PrivilegedInfo = PrivilegedInfo.NONE
     simulator_options: Mapping[str, Any] = MappingProxyType({})
+    plans_on_estimates: bool = False
     heeds_objective: bool = True
 
     def __repr__(self) -> str:

@@ -12,9 +12,11 @@ import os
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Protocol
 
-from marl_sched.agents.base import ObservationScheduler
+import numpy as np
+
+from marl_sched.agents.base import ObservationScheduler, Scheduler
 from marl_sched.agents.recurrent import LocalAgent, RecurrentScheduler
 from marl_sched.agents.registry import create_scheduler
 from marl_sched.comms.metrics.throttle import ThrottledLog
@@ -38,8 +40,7 @@ class PolicyMind:
     def __init__(self, options: AgentOptions) -> None:
         self._options = options
         self._state: LocalState | None = None
-        self._scheduler: ObservationScheduler | RecurrentScheduler | None = None
-        self._agent: LocalAgent | None = None
+        self._decider: Decider | None = None
 
     def meet(self, frame: wire.Frame) -> tuple[str, Sequence[str]]:
         """See Mind.meet. Raises InvalidOptionError for an agent that does not exist or a policy that cannot decide."""
@@ -55,9 +56,8 @@ class PolicyMind:
             self._state = domain.telemetry.local_state(frame.problem, self._options.agent)
         except InvalidMessageError as error:
             raise DeploymentError(f"the world's frame cannot be read: {error}") from error
-        if self._scheduler is None:
-            self._scheduler = load_policy(self._options.policy, domain)
-            self._agent = LocalAgent(self._scheduler)
+        if self._decider is None:
+            self._decider = decider_of(self._options.policy, domain)
         return domain.agent_prefix, self._state.channels
 
     def learn(self, channel: str, payload: bytes) -> None:
@@ -66,25 +66,22 @@ class PolicyMind:
 
     def forget(self) -> bool:
         """See Mind.forget."""
-        agent = self._known()[1]
-        agent.reset()
-        return agent.memory is not None
+        return self._known()[1].forget()
 
     def choose(self, noise: float) -> tuple[int, int | None]:
         """The policy's action, and how many decisions its memory held before it; None without a memory."""
-        state, agent = self._known()
-        remembered = agent.remembered
-        return agent.choose(state.observe(), noise), remembered
+        state, decider = self._known()
+        return decider.choose(state, noise)
 
     def rehearse(self) -> None:
         """Decide once and forget it: the first decision of a policy is slow."""
-        if self._scheduler is not None:
-            LocalAgent(self._scheduler).choose(self._known()[0].observe(), 0.5)
+        state, decider = self._known()
+        decider.rehearse(state)
 
-    def _known(self) -> tuple[LocalState, LocalAgent]:
-        if self._state is None or self._agent is None:
+    def _known(self) -> tuple[LocalState, Decider]:
+        if self._state is None or self._decider is None:
             raise RuntimeError("the world has not been met")
-        return self._state, self._agent
+        return self._state, self._decider
 
 
 class Agent:
@@ -157,12 +154,76 @@ class Agent:
                     self._warnings.warn(kind, text, self._clock())
 
 
-def load_policy(policy: str, domain: Any) -> ObservationScheduler | RecurrentScheduler:
-    """A policy that decides on one agent's observation and memory; InvalidOptionError for one that needs more."""
+class Decider(Protocol):
+    """Decides for one agent on what that was told."""
+
+    def choose(self, state: LocalState, noise: float) -> tuple[int, int | None]:
+        """The action, and how many decisions a memory held before it; None without a memory."""
+
+    def forget(self) -> bool:
+        """Begin with an empty memory, or without a plan; whether there is a memory at all."""
+
+    def rehearse(self, state: LocalState) -> None:
+        """Decide once and forget it."""
+
+
+class PolicyDecider:
+    """Decides by a policy on the agent's observation, with the agent's memory; see Decider."""
+
+    def __init__(self, policy: ObservationScheduler | RecurrentScheduler) -> None:
+        self._policy, self._agent = policy, LocalAgent(policy)
+
+    def choose(self, state: LocalState, noise: float) -> tuple[int, int | None]:
+        """See Decider.choose."""
+        remembered = self._agent.remembered
+        return self._agent.choose(state.observe(), noise), remembered
+
+    def forget(self) -> bool:
+        """See Decider.forget."""
+        self._agent.reset()
+        return self._agent.memory is not None
+
+    def rehearse(self, state: LocalState) -> None:
+        """See Decider.rehearse."""
+        LocalAgent(self._policy).choose(state.observe(), 0.5)
+
+
+class PlanDecider:
+    """Plans for the whole team, each agent for itself, on what it was told as a simulator; see Decider."""
+
+    def __init__(self, planner: Scheduler) -> None:
+        self._planner, self._begun = planner, False
+
+    def choose(self, state: LocalState, noise: float) -> tuple[int, int | None]:
+        """See Decider.choose. InvalidOptionError where the view hides something."""
+        simulator = state.simulator()
+        if simulator is None:
+            name = self._planner.name
+            raise InvalidOptionError(f"{name} plans for the whole team: expected a view that hides nothing")
+        if not self._begun:
+            self._planner.start(simulator, np.ones(1, np.bool_))
+            self._begun = True
+        return int(self._planner.decide(simulator)[0]), None
+
+    def forget(self) -> bool:
+        """See Decider.forget."""
+        self._begun = False
+        return False
+
+    def rehearse(self, state: LocalState) -> None:
+        """See Decider.rehearse."""
+        self.choose(state, 0.5)
+        self.forget()
+
+
+def decider_of(policy: str, domain: Any) -> Decider:
+    """What decides by a policy on what one agent is told; InvalidOptionError for a policy that needs more."""
     scheduler = create_scheduler(policy, domain)
-    if not isinstance(scheduler, ObservationScheduler | RecurrentScheduler):
-        raise InvalidOptionError(f"{policy} needs more than an agent's own observation and cannot be deployed")
-    return scheduler
+    if isinstance(scheduler, ObservationScheduler | RecurrentScheduler):
+        return PolicyDecider(scheduler)
+    if scheduler.plans_on_estimates:
+        return PlanDecider(scheduler)
+    raise InvalidOptionError(f"{policy} needs more than an agent is told and cannot be deployed")
 
 
 def run(options: AgentOptions, progress: Any = None) -> Counter[str]:

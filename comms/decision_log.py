@@ -34,6 +34,7 @@ class Header(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         problem: as `Problem.as_json` gives it.
         identity: of its instance, in hexadecimal digits: a file may change, and a generator.
         conflict: how choices of one action are settled, see WorldOptions.
+        plant: what made the plant, "" for the simulated one.
     """
 
     schema: int
@@ -41,6 +42,7 @@ class Header(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     problem: dict[str, Any]
     identity: str
     conflict: str
+    plant: str = ""
 
     @classmethod
     def of(cls, options: WorldOptions) -> Header:
@@ -52,6 +54,7 @@ class Header(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             problem=problem.as_json(),
             identity=f"{int(problem.instances[0].identity):016x}",
             conflict=options.conflict,
+            plant=options.plant_factory,
         )
 
 
@@ -169,7 +172,9 @@ def _whole_lines(path: Path) -> tuple[list[Line], int]:
 def _difference(found: Line, expected: Header) -> str:
     if not isinstance(found, Header):
         return "no header"
-    ours, theirs = ({**one.problem, "run": one.run, "conflict": one.conflict} for one in (expected, found))
+    ours, theirs = (
+        {**one.problem, "run": one.run, "conflict": one.conflict, "plant": one.plant} for one in (expected, found)
+    )
     pairs = {name: (theirs.get(name), value) for name, value in ours.items()}
     pairs["identity"] = (found.identity, expected.identity)
     return ", ".join(f"{name} {was!r} instead of {now!r}" for name, (was, now) in pairs.items() if was != now)

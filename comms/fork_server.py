@@ -147,20 +147,20 @@ def warm_up(world: Any, policies: list[str]) -> None:
     """Import, load from disk and compile what the processes are about to use."""
     import numpy as np
 
-    from marl_sched.agents.recurrent import LocalAgent
-    from marl_sched.comms.agent import load_policy
+    from marl_sched.comms.agent import decider_of
     from marl_sched.comms.plant import SimulatedPlant
 
-    plant = SimulatedPlant(world.domain, world.telemetry(), world.simulator())
+    plant = world.plant()
     state = plant.state()
-    local = plant.telemetry.local_state(plant.frame, 0)
+    local = world.telemetry().local_state(plant.frame, 0)
     for channel, payload in state.changed.items():
         if channel in local.channels:
             local.hear(channel, payload)
     for policy in policies:
-        LocalAgent(load_policy(policy, plant.domain)).choose(local.observe(), 0.5)
-    plant.simulator.observe(plant.simulator.acting)
-    plant.simulator.step(np.zeros(1, np.int64))
+        decider_of(policy, world.domain).rehearse(local)
+    if isinstance(plant, SimulatedPlant):
+        plant.simulator.observe(plant.simulator.acting)
+        plant.simulator.step(np.zeros(1, np.int64))
 
 
 def main() -> None:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from marl_sched.comms.agent import Agent
     from marl_sched.comms.decision_log import CommitLog
     from marl_sched.comms.metrics.report import RunReport
+    from marl_sched.comms.plant import Plant
 
 Deliver = Callable[[str, bytes], int]
 
@@ -88,13 +89,14 @@ class Node:
         self.bus, self.inbox = bus, Inbox()
         self.dropped: Counter[str] = self.inbox.dropped
         self.subscribed: set[str] = set()
+        self.wild: set[str] = set()  # those of them that hold wildcards
         self.watched: set[str] = set()
         self.served: set[str] = set()
         self.on_put: Callable[[str, bytes], None] | None = None  # may raise, to play a process that dies
 
     def hears(self, key: str) -> bool:
         """Whether a message by that key arrives here."""
-        return any(fnmatchcase(key, pattern) for pattern in self.subscribed)
+        return key in self.subscribed or any(fnmatchcase(key, pattern) for pattern in self.wild)
 
     def watches(self, key: str) -> bool:
         """Whether this node is told of a token."""
@@ -118,11 +120,14 @@ class Node:
         """See Transport.subscribe."""
         with self.bus.lock:
             self.subscribed.add(key)
+            if "*" in key:
+                self.wild.add(key)
 
     def unsubscribe(self, key: str) -> None:
         """See Transport.unsubscribe."""
         with self.bus.lock:
             self.subscribed.discard(key)
+            self.wild.discard(key)
 
     def watch(self, key: str) -> None:
         """See Transport.watch."""
@@ -171,7 +176,7 @@ class Node:
     def _disconnect(self) -> None:
         for token in [token for token, holder in self.bus.tokens.items() if holder is self]:
             self.bus.set_token(self, token, stands=False)
-        for keys in (self.subscribed, self.watched, self.served):
+        for keys in (self.subscribed, self.wild, self.watched, self.served):
             keys.clear()
         if self in self.bus.nodes:
             self.bus.nodes.remove(self)
@@ -193,11 +198,12 @@ class Threads:
         *,
         agent_rules: AgentRules | None = None,
         commits: CommitLog | None = None,
+        plant: Plant | None = None,
     ) -> None:
         from marl_sched.comms.world import World
 
         self.options, self.policies, self.bus = options, list(policies), bus or Bus()
-        self.world = World(options, self.bus.node(), commits=commits)
+        self.world = World(options, self.bus.node(), commits=commits, plant=plant)
         self.nodes = [self.bus.node() for _ in self.policies]
         self.agents: list[Agent | None] = [None] * len(self.policies)
         self.errors: list[BaseException] = []

@@ -44,7 +44,7 @@ POLL = 0.05  # seconds between two looks at the processes
 LEAVE = 10.0  # seconds that processes have to leave when the run is over or interrupted
 FIRST_DELAY, LAST_DELAY, STEADY = 0.1, 5.0, 30.0  # seconds: until a restart, at most, and alive until that is forgotten
 BEING_STARTED = -1  # in place of a process's id
-Progress = Callable[[str, int, int], None]  # (phase, simulated time, horizon)
+Progress = Callable[[str, int, int], None]  # (phase, how much of the horizon has passed, horizon)
 
 
 @dataclass
@@ -89,8 +89,7 @@ class Deployment:
     def __init__(self, options: DeployOptions) -> None:
         self.options = options
         options.world.telemetry()
-        simulator = options.world.simulator()
-        self._n_agents = int(simulator.n_agents[0])
+        self._n_agents = options.world.plant().n_agents
         self.policies = options.policies(self._n_agents)
         self.started_here = options.started_here(self._n_agents)
         for policy in sorted(set(self.policies)):

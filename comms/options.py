@@ -14,10 +14,11 @@ from marl_sched.comms.transport.endpoints import is_encrypted, is_loopback
 from marl_sched.comms.transport.faulty import Faults
 from marl_sched.domain import Domain, Telemetry
 from marl_sched.errors import InvalidOptionError, require
+from marl_sched.plugins import import_object
 from marl_sched.problem import Problem
 
 if TYPE_CHECKING:
-    from marl_sched.comms.plant import SimulatedPlant
+    from marl_sched.comms.plant import Plant, SimulatedPlant
     from marl_sched.simulation import TurnSimulator
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
@@ -35,6 +36,7 @@ class WorldOptions:
 
     Attributes:
         problem: of one instance, of which episode 0 is played.
+        plant_factory: `package.module:function` that makes the Plant from these options; "": the domain's simulator.
         run: the run's name, part of every key.
         listen: endpoint, port 0 takes a free one.
         certs: folder of certificates, which a `tls/` endpoint needs; see `marl-sched certs`.
@@ -62,6 +64,7 @@ class WorldOptions:
     """
 
     problem: Problem
+    plant_factory: str = ""
     run: str = "run"
     listen: str = DEFAULT_ENDPOINT
     certs: str = ""
@@ -150,8 +153,15 @@ class WorldOptions:
         simulator.reset(seed=self.problem.seed, episodes=self.problem.episode_numbers([0]))
         return simulator
 
-    def plant(self, **extra: Any) -> SimulatedPlant:
-        """The plant at the start of its episode; `extra` as for `simulator`."""
+    def plant(self) -> Plant:
+        """What is played: the plant that `plant_factory` makes, or the simulated one."""
+        if not self.plant_factory:
+            return self.simulated_plant()
+        made: Plant = import_object(self.plant_factory)(self)
+        return made
+
+    def simulated_plant(self, **extra: Any) -> SimulatedPlant:
+        """The domain's simulator as a plant, at the start of its episode; `extra` as for `simulator`."""
         from marl_sched.comms.plant import SimulatedPlant, SimultaneousPlant
 
         kind = SimultaneousPlant if self.conflict == "priority" else SimulatedPlant

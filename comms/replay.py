@@ -36,7 +36,9 @@ def replay(path: Path, picture: Path | None = None) -> RunReport:
     if picture is not None and PICTURE not in domain.render:
         raise InvalidOptionError(f"picture: {domain.name} draws none")
     extra = domain.render_options.get(PICTURE, {}) if picture is not None else {}
-    plant = options.plant(**extra)
+    if header.plant:
+        raise InvalidFileError(path, "plant", "the simulated one, which can be played again", header.plant)
+    plant = options.simulated_plant(**extra)
     steps = [line for line in lines if isinstance(line, Step)]
     play_again(plant, steps, path)
     if picture is not None:

@@ -33,7 +33,7 @@ from marl_sched.errors import DeploymentError, InvalidMessageError
 from marl_sched.files import write_json
 
 log = logging.getLogger(__name__)
-Progress = Callable[[str, int, int], None]  # (phase, simulated time, horizon)
+Progress = Callable[[str, int, int], None]  # (phase, how much of the horizon has passed, horizon)
 
 
 class Refusals:
@@ -80,7 +80,8 @@ class World:
         self.commits = commits if commits is not None else MemoryLog()
         resumed = isinstance(self.commits, FileLog) and self.commits.resumed
         if isinstance(self.commits, FileLog) and resumed:
-            play_again(self.plant, self.commits.steps(), self.commits.path)
+            if self.plant.simulated:
+                play_again(self.plant, self.commits.steps(), self.commits.path)
             self.commits.append(Resumed(epoch=self.epoch))
         self.protocol = WorldProtocol(
             options.rules(),
@@ -97,7 +98,8 @@ class World:
         self._warnings = ThrottledLog(log)
         self._progress = progress or (lambda phase, tick, horizon: None)
         self._told: tuple[str, int] = ("", -1)
-        self._tick = 0
+        self._chosen: dict[int, ev.Choice] = {}  # by agents whose turn has not come yet
+        self._tick = self._passed = 0
         self._refused = refused or Refusals()
         self._observation = Observation(self.domain.agent_prefix, self.telemetry.time_unit, options.problem.horizon)
 
@@ -126,7 +128,7 @@ class World:
         for key in (self._keys.hello("*"), self._keys.decision("*")):
             self.transport.subscribe(key)
         self.transport.watch(self._keys.alive("*", "*"))
-        for key in (keys.FRAME, keys.snapshot("*")):
+        for key in (keys.FRAME, keys.snapshot("*"), keys.COMMAND):
             self.transport.serve(key)
         self.transport.announce(keys.WORLD_ALIVE)
         self._tell_progress()
@@ -138,7 +140,7 @@ class World:
             self._count_heard(event)
         effects = self.protocol.handle(ev.Wake() if event is None else event, self._clock())
         self._perform(effects)
-        if isinstance(event, ev.Queried) and not any(isinstance(effect, ev.Reply) for effect in effects):
+        if isinstance(event, ev.Queried) and not any(isinstance(effect, ev.Reply | ev.Order) for effect in effects):
             self.transport.reply(event.query, None)
         self._tell_progress()
 
@@ -162,6 +164,9 @@ class World:
                     payload = wire.encode(message)
                     self.metrics.note_sent("world/answer", payload)
                     self.transport.reply(query, payload)
+                case ev.Order(query, order):
+                    answer = ev.Ordered(query, order.request, self.plant.order(order))
+                    self._perform(self.protocol.handle(answer, self._clock()))
                 case ev.Apply(choices):
                     self._apply(choices)
                 case ev.Note():
@@ -187,20 +192,24 @@ class World:
         self.transport.put(keys.OBSERVED, wire.encode(said))
 
     def _apply(self, choices: tuple[ev.Choice, ...]) -> None:
+        self._chosen.update((choice.agent, choice) for choice in choices)
         commits = self.plant.apply(choices)
-        self.commits.append(Step(commits=commits, sources=[choice.source for choice in choices]))
-        self._observation.note(commits)
-        self.metrics.note_applied(self._clock())
-        for choice, commit in zip(choices, commits, strict=True):
+        if commits:
+            sources = [self._chosen.pop(commit.agent).source for commit in commits]
+            self.commits.append(Step(commits=commits, sources=sources))
+            self._observation.note(commits)
+            self.metrics.note_applied(self._clock())
+        for choice in choices:
             if choice.outcome == ev.Outcome.DECIDED:
                 self.metrics.latency.add(choice.latency)
+        for commit in commits:
             self.metrics.counts["conflicts"] += commit.outcome == ev.Outcome.CONFLICT
             self.metrics.counts["illegal"] += commit.outcome == ev.Outcome.ILLEGAL
         self._advance()
 
     def _advance(self) -> None:
         state = self.plant.state()
-        self._tick = state.tick
+        self._tick, self._passed = state.tick, state.progress
         self._perform(self.protocol.handle(state, self._clock()))
 
     def _note(self, note: ev.Note) -> None:
@@ -215,7 +224,7 @@ class World:
         log.info("%s %d: %s %s", self.telemetry.time_unit, self._tick, name, note.event)
 
     def _tell_progress(self) -> None:
-        now = (self.protocol.phase, self._tick)
+        now = (self.protocol.phase, self._passed)
         if now != self._told:
             self._told = now
             self._progress(*now, self.options.problem.horizon)

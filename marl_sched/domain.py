@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from numbers import Real
 from pathlib import Path
@@ -74,6 +74,14 @@ class LocalState(Protocol):
     def observe(self) -> dict[str, np.ndarray]:
         """The agent's observation with B = 1, bit-equal to the simulator's when every channel is up to date."""
 
+    def simulator(self) -> TurnSimulator | None:
+        """What the agent was told as a simulator in which it is to decide, for schedulers that plan from a whole state.
+
+        Row 0 holds what every channel says, with estimates in place of what nobody is told, and without the noise.
+        It is for reading, and holds until the next call. None where the view hides something, or the domain has no
+        such thing.
+        """
+
 
 class Telemetry(Protocol):
     """How a domain's true state is told over a wire, and what an agent makes of the part that it may hear.
@@ -91,8 +99,15 @@ class Telemetry(Protocol):
     def frame(self, simulator: Any) -> bytes:
         """What every agent is told at the start: sizes, padding and view, nothing that a view hides."""
 
-    def messages(self, simulator: Any) -> dict[str, bytes]:
-        """Everything the world says at this decision epoch: channel -> payload."""
+    def messages(self, simulator: Any, channels: Collection[str] | None = None) -> dict[str, bytes]:
+        """Everything the world says at this decision epoch, channel -> payload; with `channels`, of those alone."""
+
+    def turn_channels(self, simulator: Any, agent: int) -> Collection[str]:
+        """The channels that a turn of this agent can change as long as no simulated time passes.
+
+        Only they are encoded after such a turn. Agents that may act at one decision epoch are asked at once where none
+        of them hears a channel that an earlier one's turn can change.
+        """
 
     def series(self, simulator: Any) -> dict[str, list[float]]:
         """The objectives of every unit of time so far, name -> one value for each."""

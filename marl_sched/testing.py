@@ -45,7 +45,8 @@ def check_domain(
 
     Instances come back from their files; the simulator keeps its promises at every turn (`check_turns`); the same
     choices give the same trace in a batch, in PettingZoo's AEC and, where torch is installed, in TorchRL, to the last
-    bit; with telemetry every agent's local state shows what the simulator shows it.
+    bit; with telemetry every agent's local state shows what the simulator shows it, and a turn in which no time passes
+    changes no channel but those that `turn_channels` names.
     """
     domain = domain if isinstance(domain, Domain) else get_domain(domain)
     for kind in domain.views:
@@ -302,9 +303,15 @@ def _check_telemetry(problem: Problem) -> None:
         return
     frame = telemetry.frame(simulator)
     known = [telemetry.local_state(frame, agent) for agent in range(int(simulator.n_agents[0]))]
-    number = 0
+    number, said, touched = 0, dict[str, bytes](), None
     while simulator.acting[0] >= 0:
-        said = telemetry.messages(simulator)
+        before, said = said, telemetry.messages(simulator)
+        changed = {channel for channel, payload in said.items() if before.get(channel) != payload}
+        _require(touched is None or changed <= touched, f"turn {number}: turn_channels are all that a turn can change")
+        _require(
+            telemetry.messages(simulator, changed) == {channel: said[channel] for channel in changed},
+            f"turn {number}: of some channels messages says what it says of all",
+        )
         for agent, state in enumerate(known):
             for channel in state.channels:
                 if channel in said:
@@ -315,7 +322,9 @@ def _check_telemetry(problem: Problem) -> None:
             for name, array in seen.items():
                 same = array.tobytes() == np.asarray(heard[name]).tobytes()
                 _require(same, f"turn {number}: agent {agent}: {name} from messages is the simulator's")
+        possible = set(telemetry.turn_channels(simulator, int(simulator.acting[0])))
         simulator.step(np.array([_choice(simulator.legal()[0], number)]))
+        touched = None if simulator.elapsed[0] > 0 else possible
         number += 1
 
 

@@ -237,6 +237,8 @@ def dispatched(problem: Round, rule: str) -> Plan:
 class DispatchingRule(PlanningScheduler):
     """Plays a rule of DISPATCHING_RULES; in `online` mode anew whenever a task did not end when it was expected to."""
 
+    plans_on_estimates = True
+
     def __init__(self, rule: str) -> None:
         super().__init__()
         self.name = require("dispatching rule", rule, DISPATCHING_RULES)

@@ -136,6 +136,7 @@ class LeastLatestStart(PlanningScheduler):
     """
 
     name = "lst"
+    plans_on_estimates = True
 
     def __init__(self, margin: float = 0.0) -> None:
         super().__init__()
@@ -170,6 +171,7 @@ class LstSearch(LeastLatestStart):
     """The best schedule of a hill climb on the rule's keys within a budget, see `search_plan`."""
 
     name = "lst-search"
+    plans_on_estimates = False  # its random numbers are those of the episode, whose key no agent is told
 
     def __init__(
         self, evaluations: int | None = EVALUATIONS, seconds: float | None = None, margin: float = 0.0

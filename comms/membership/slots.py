@@ -90,6 +90,7 @@ class Slot:
         early: the last hello that came before its incarnation's token.
         remembered: decisions that its incarnation's memory held at the last one, None without a memory or before any.
         memory_began: simulated time at which that memory was first decided with, None without a memory.
+        moves: shared by all slots of a membership, see there.
     """
 
     state: SlotState = SlotState.VACANT
@@ -108,10 +109,13 @@ class Slot:
     early: Hello | None = None
     remembered: int | None = None
     memory_began: int | None = None
+    moves: Moves = field(default_factory=lambda: Moves())
 
     def move(self, event: SlotEvent) -> None:
         """Go where TRANSITIONS says; KeyError, which is a defect, where it says nothing."""
-        self.state = TRANSITIONS[self.state, event]
+        before, self.state = self.state, TRANSITIONS[self.state, event]
+        self.moves.all += event != SlotEvent.ASK
+        self.moves.lasting += before not in PRESENT or self.state not in PRESENT
 
     def remember(self, remembered: int | None, time: int) -> bool:
         """Note what an incarnation says of its memory at a decision; True if it is its first with a memory."""
@@ -132,8 +136,24 @@ def max_misses(patience: int) -> int:
     return 2 * patience
 
 
+@dataclass
+class Moves:
+    """Counts moves, so that what follows from the states of all slots is worked out only when one has changed.
+
+    Attributes:
+        all: but those by which a ready agent is asked.
+        lasting: but those between the states in which an agent is present.
+    """
+
+    all: int = 0
+    lasting: int = 0
+
+
 class Membership:
     """The slots of all agents.
+
+    Attributes:
+        moves: how often slots have changed their state.
 
     After `patience` misses in a row an incarnation is given up. Its successors inherit the misses: each is given up
     at its first miss, and after `max_misses(patience)` in a row the slot is barred for `bar` seconds, then one more
@@ -141,8 +161,10 @@ class Membership:
     """
 
     def __init__(self, n_agents: int, patience: int, bar: float) -> None:
-        self.slots = [Slot() for _ in range(n_agents)]
+        self.moves = Moves()
+        self.slots = [Slot(moves=self.moves) for _ in range(n_agents)]
         self._patience, self._bar = patience, bar
+        self._counted_at, self._staying, self._present = -1, 0, 0
 
     def absent(self) -> list[int]:
         """Agents that nobody speaks for, but for those that left."""
@@ -150,8 +172,11 @@ class Membership:
 
     def quorate(self, quorum: float) -> bool:
         """Whether at least the share `quorum` of the agents that have not left is present, one at least."""
-        staying = sum(slot.state != SlotState.LEFT for slot in self.slots)
-        return sum(slot.present for slot in self.slots) >= max(math.ceil(quorum * staying), min(staying, 1))
+        if self._counted_at != self.moves.lasting:
+            self._counted_at = self.moves.lasting
+            self._staying = sum(slot.state != SlotState.LEFT for slot in self.slots)
+            self._present = sum(slot.present for slot in self.slots)
+        return self._present >= max(math.ceil(quorum * self._staying), min(self._staying, 1))
 
     def refusal(self, agent: int, incarnation: str) -> Refusal | None:
         """Why an incarnation cannot be registered, None if it can."""

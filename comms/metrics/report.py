@@ -73,6 +73,7 @@ class RunReport(Struct, frozen=True, kw_only=True):
         unit, time_unit: what the horizon and simulated time count.
         view: as JSON; `visible_share` is the mean share of the graph that deciding agents saw, None without a turn.
         time: simulated time at the end.
+        progress: how much of the horizon had passed, in `unit`.
         objectives: means over the run, by name; `M1` is that of the run's objective.
         series: objectives of every unit of time.
         rewards: one for each decision.
@@ -81,7 +82,7 @@ class RunReport(Struct, frozen=True, kw_only=True):
         events, events_not_kept: the first MAX_EVENTS, and how many there were beyond.
         delay_bound_s: the most that one agent that is there and slow delays the others in vain before it is barred, in
             all its incarnations together.
-        longest_pause_s: between two decisions that were applied.
+        playing_s: from the first decisions that were applied to the last; longest_pause_s: between two of them.
         exit_codes, restarts, seconds_in_all: of all processes, where a launcher started them.
         from_log: the log that the run was played again from.
     """
@@ -97,6 +98,7 @@ class RunReport(Struct, frozen=True, kw_only=True):
     view: dict[str, Any]
     visible_share: float | None
     time: int
+    progress: int
     objectives: dict[str, float]
     series: dict[str, list[float]]
     agents: list[AgentReport]
@@ -113,6 +115,7 @@ class RunReport(Struct, frozen=True, kw_only=True):
     deadline_s: float
     delay_bound_s: float
     standstill_s: float
+    playing_s: float
     longest_pause_s: float
     slept_s: float
     seconds: float
@@ -169,7 +172,7 @@ class RunReport(Struct, frozen=True, kw_only=True):
                 **times,
                 "visible_share": view.pop("visible_share"),
                 "view": view,
-                "series": {name: data[name] for name in data["objectives"] if name in data},
+                "series": {name: data[name] for name in data["objectives"] if isinstance(data.get(name), list)},
                 "counts": {name: data[name] for name in COUNTS if name in data},
             }
             return convert(plain, cls)
@@ -223,6 +226,7 @@ def build_report(
         view=view_as_json(problem.view),
         visible_share=round(sum(shares) / len(shares), 4) if shares else None,
         time=summary.time,
+        progress=summary.progress,
         objectives=summary.objectives,
         series=summary.series,
         agents=[_agent(domain.agent_name(i), slot, summary.of_agent(i)) for i, slot in enumerate(slots)],
@@ -247,6 +251,7 @@ def build_report(
         deadline_s=options.deadline,
         delay_bound_s=round(options.deadline * max_misses(options.patience), 6),
         standstill_s=round(metrics.standstill_s, 3),
+        playing_s=round(metrics.playing_s, 6),
         longest_pause_s=round(metrics.longest_pause_s, 3),
         slept_s=round(metrics.slept_s, 3),
         seconds=round(seconds, 3),

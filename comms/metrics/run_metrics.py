@@ -66,23 +66,29 @@ class RunMetrics:
     slept_s: float = 0.0
     longest_pause_s: float = 0.0  # between two decisions that were applied
     applied_at: float | None = None
+    playing_s: float = 0.0  # from the first decisions that were applied to the last
     sent: Counter[str] = field(default_factory=Counter)
     sent_bytes: Counter[str] = field(default_factory=Counter)
     heard: Counter[str] = field(default_factory=Counter)
     heard_bytes: Counter[str] = field(default_factory=Counter)
     counts: Counter[str] = field(default_factory=Counter)
     injected: Counter[str] = field(default_factory=Counter)  # faults of the world's own messages, by kind
+    _kinds: dict[str, str] = field(default_factory=dict)  # of the world's own keys, whose number is fixed
 
     def note_applied(self, now: float) -> None:
         """Note that decisions were applied."""
         if self.applied_at is not None:
             self.longest_pause_s = max(self.longest_pause_s, now - self.applied_at)
+            self.playing_s += now - self.applied_at
         self.applied_at = now
 
     def note_sent(self, key: str, payload: bytes) -> None:
         """Count a message of the world."""
-        self.sent[kind_of(key)] += 1
-        self.sent_bytes[kind_of(key)] += len(payload)
+        kind = self._kinds.get(key)
+        if kind is None:
+            kind = self._kinds[key] = kind_of(key)
+        self.sent[kind] += 1
+        self.sent_bytes[kind] += len(payload)
 
     def note_heard(self, kind: str, payload: bytes) -> None:
         """Count a message to the world; `kind` is one of few words, whatever its key was."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 
-from marl_sched.comms.protocol.messages import Message, Turn
+from marl_sched.comms.protocol.messages import Message, Operator, Turn, Work
 
 
 class ExitCode(IntEnum):
@@ -107,12 +107,25 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class PlantAdvanced:
-    """Where the plant stands now: who is to decide, and every channel that changed since the last time."""
+    """Where the plant stands now: who is to decide, and every channel that changed since the last time.
+
+    `progress` counts units of the run's horizon, such as rounds; the protocol does not look at it.
+    """
 
     tick: int
     requests: tuple[Request, ...]
     changed: dict[str, bytes]
     over: bool = False
+    progress: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Ordered:
+    """The plant's answer to Order(query, order): why it does not carry it out, None if it does."""
+
+    query: int
+    request: str
+    reason: str | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,6 +151,7 @@ Event = (
     | Wake
     | Interrupted
     | PlantAdvanced
+    | Ordered
     | Chosen
     | Reopened
 )
@@ -171,6 +185,14 @@ class Choice:
     outcome: Outcome
     latency: float = 0.0  # seconds from the turn to the decision
     source: str = ""  # `incarnation/sequence` of the decision, which no other decision has
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """Ask the plant to carry out an order; Ordered follows."""
+
+    query: int
+    order: Work | Operator
 
 
 @dataclass(frozen=True, slots=True)
@@ -273,6 +295,7 @@ Effect = (
     Put
     | Reply
     | Apply
+    | Order
     | Note
     | Count
     | Warn

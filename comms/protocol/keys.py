@@ -7,6 +7,7 @@
 | `world/clock` | world to all | Clock |
 | `world/alive` | liveliness token of the world | |
 | `world/observed` | world to observers | Observed |
+| `world/command` | query to the world by an operator | Team, Work, Operator; Accepted, Declined |
 | `<channel>` | world to those who may hear it | News |
 | `crew/<id>/turn` | world to that agent | Turn, Welcome, Fenced, Refused |
 | `crew/<id>/hello` | agent to world | Hello, Beat, Goodbye |
@@ -21,6 +22,7 @@ import re
 from marl_sched.errors import InvalidMessageError, InvalidOptionError
 
 CLOCK, FRAME, WORLD_ALIVE, OBSERVED = "world/clock", "world/frame", "world/alive", "world/observed"
+COMMAND = "world/command"
 INCARNATION = r"[0-9a-zA-Z-]{1,48}"
 MAX_KEY = 256  # characters of a key that is looked at
 

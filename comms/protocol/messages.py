@@ -194,6 +194,60 @@ class Observed(Message, tag="observed.1", frozen=True):
     last_error: Sentence
 
 
+class Team(Message, tag="team.1", frozen=True):
+    """An operator's order about the team. `request` is a name of the asker's choice; `epoch` may be "" for any.
+
+    `pause` and `resume` the run; `drain`: the agent is not asked any more, what it is at is finished; `readmit`: it is
+    asked again, also if it had been barred.
+    """
+
+    request: Word
+    kind: Literal["pause", "resume", "drain", "readmit"]
+    agent: Natural | None = None
+
+
+class Work(Message, tag="work.1", frozen=True):
+    """An order to change the work of a running plant; it is for the plant to say whether it can.
+
+    `add`: `data` describes the work in the domain's own form; `cancel`, `repeat`, `reprioritise` the work `entity`,
+    the latter to `priority`; `at`: simulated time from which it holds, None: now.
+    """
+
+    request: Word
+    kind: Literal["add", "cancel", "repeat", "reprioritise"]
+    entity: Word = ""
+    priority: float | None = None
+    at: Natural | None = None
+    data: bytes = b""
+
+
+class Operator(Message, tag="operator.1", frozen=True):
+    """An order that binds an agent's choices until a simulated time, None: until it is taken back by another.
+
+    `pin`: nobody else takes `action`, and the agent takes nothing else; `forbid`: the agent does not take it; `force`:
+    it is the agent's next choice; `hold`: the agent does nothing.
+    """
+
+    request: Word
+    kind: Literal["pin", "forbid", "force", "hold"]
+    agent: Natural
+    action: Natural | None = None
+    until: Natural | None = None
+
+
+class Accepted(Message, tag="accepted.1", frozen=True):
+    """An order holds from now on."""
+
+    request: Word
+
+
+class Declined(Message, tag="declined.1", frozen=True):
+    """An order changes nothing, and why."""
+
+    request: Word
+    reason: Sentence
+
+
 ToAgent = Turn | Welcome | Fenced | Refused
 FromAgent = Hello | Beat | Goodbye
 

@@ -26,6 +26,7 @@ class WorldRules:
         unheard: an agent without a turn that says nothing for that long is missing.
         slept: the world takes a wake-up that is late by more than that for its own sleep.
         resend: until an open turn is sent again.
+        poll: until a plant in which nobody has anything to decide is asked again.
         farewell: in which agents may leave at the end.
         bar: how long nobody may register for an agent that was waited for in vain too often.
     """
@@ -42,6 +43,7 @@ class WorldRules:
     unheard: float = 3.0
     slept: float = 1.0
     resend: float = 0.1
+    poll: float = 0.05
     farewell: float = 2.0
     bar: float = 60.0
 

@@ -15,6 +15,7 @@ from marl_sched.comms.protocol import events as ev
 from marl_sched.comms.protocol import keys
 from marl_sched.comms.protocol import messages as wire
 from marl_sched.comms.protocol.answers import Answers
+from marl_sched.comms.protocol.commands import Commands
 from marl_sched.comms.protocol.reception import Reception
 from marl_sched.comms.protocol.rules import WorldRules
 from marl_sched.errors import InvalidMessageError
@@ -73,7 +74,9 @@ class WorldProtocol:
         self._paced_from, self._held_until, self._tick_end = 0.0, -math.inf, math.inf
         self._last, self._forgiving_until = now, -math.inf
         self._ready_by, self._clock_at, self._standing_since = now + rules.ready, now, math.inf
-        self._farewell_by = math.inf
+        self._farewell_by, self._poll_at = math.inf, -math.inf
+        self._slots_seen, self._slots_due_at = -1, math.inf
+        self._commands = Commands(self.members, run, epoch, now)
         self._reception = Reception(self.members, self._keys, run, epoch)
         self._answers = Answers(
             wire.Frame(run=run, epoch=epoch, env=env, agents=len(channels), heartbeat=rules.heartbeat, problem=frame),
@@ -91,6 +94,10 @@ class WorldProtocol:
                 self._hear(event, now, out)
             case ev.TokenAppeared() | ev.TokenVanished():
                 self._token(event, now, out)
+            case ev.Queried(key=keys.COMMAND):
+                self._command(event, now, out)
+            case ev.Ordered(query, request, reason):
+                out.append(self._commands.answer(query, request, reason))
             case ev.Queried():
                 out += self._answers.answer(event, now, tick=self._tick, phase=self.phase, news=self._news)
             case ev.PlantAdvanced():
@@ -107,24 +114,40 @@ class WorldProtocol:
         slept = now - max(self._last, self.wake_at)
         if slept <= self.rules.slept:
             return
+        self._move_deadlines(slept, now)
+        self._forgiving_until = now + max(RECOVERY, self.rules.grace)
+        out.append(ev.Note(-1, "slept", slept))
+
+    def _move_deadlines(self, slept: float, now: float) -> None:
         for turn in self._open.values():
             turn.deadline, turn.give_up_at = turn.deadline + slept, turn.give_up_at + slept
+            turn.asked_at += slept
             turn.resend_at = min(turn.resend_at, now)
         for slot in self.members.slots:
             slot.until, slot.heard_at = slot.until + slept, now
+        self._slots_seen = -1
         self._ready_by += slept
         self._standing_since += slept
         self._paced_from += slept
         self._held_until += slept
         self._tick_end += slept
-        self._forgiving_until = now + max(RECOVERY, self.rules.grace)
-        out.append(ev.Note(-1, "slept", slept))
+
+    def _command(self, event: ev.Queried, now: float, out: list[ev.Effect]) -> None:
+        """Take an order; a pause that ends was nobody's fault, so all deadlines move."""
+        paused_at = self._commands.paused_at
+        out += self._commands.take(event, now)
+        if paused_at is not None and self._commands.paused_at is None:
+            self._move_deadlines(now - paused_at, now)
+            out.append(ev.Note(-1, "resumed", now - paused_at))
+        elif paused_at is None and self._commands.paused_at is not None:
+            out.append(ev.Note(-1, "paused"))
 
     def _pass_time(self, now: float, out: list[ev.Effect]) -> None:
         if self.ended is not None:
             return
-        if self.phase != "over":
+        if self.phase != "over" and now >= self._slots_due():
             self._watch_slots(now, out)
+            self._slots_seen = -1
         if self.phase == "over":
             if now >= self._farewell_by or not any(slot.present for slot in self.members.slots):
                 self._end(out)
@@ -156,21 +179,30 @@ class WorldProtocol:
         times = [self._clock_at, self._farewell_by]
         if self.phase == "gathering":
             times.append(self._ready_by)
-        if self._held_until > self._last:
-            times.append(self._held_until)
-        if self._standing_since < math.inf:
-            times.append(self._standing_since + self.rules.standstill)
+        times += [at for at in (self._held_until, self._poll_at) if at > self._last]
         if self._forgiving_until > self._last:
             times.append(self._forgiving_until)
+        if self._commands.paused_at is not None:
+            return min(*times, self._slots_due())
+        if self._standing_since < math.inf:
+            times.append(self._standing_since + self.rules.standstill)
         for agent, turn in self._open.items():
             if agent not in self._choices:
                 present = self.members.slots[agent].present
                 times += [turn.deadline, turn.resend_at] if present else [turn.give_up_at]
-        for slot in self.members.slots:
-            times.append(slot.until)
-            if slot.state == SlotState.READY:
-                times.append(slot.heard_at + self.rules.unheard)
-        return min(times)
+        return min(*times, self._slots_due())
+
+    def _slots_due(self) -> float:
+        """When a slot may have to be looked at, at the earliest; hearing an agent only makes it later.
+
+        With a hundred agents, looking at all slots at every event would be most of what an event costs.
+        """
+        if self._slots_seen != self.members.moves.all:
+            self._slots_seen = self.members.moves.all
+            due = [slot.until for slot in self.members.slots]
+            due += [s.heard_at + self.rules.unheard for s in self.members.slots if s.state == SlotState.READY]
+            self._slots_due_at = min(due)
+        return self._slots_due_at
 
     # ---- phases
 
@@ -199,10 +231,14 @@ class WorldProtocol:
 
     def _play(self, now: float, out: list[ev.Effect]) -> None:
         """Ask who can be asked, pass the turns of those who cannot, and apply the choices when all are there."""
-        if self._applying or now < self._held_until:
+        if self._applying or now < max(self._held_until, self._poll_at):
             return
         if self._over:
             self._finish(ev.End(ev.Ending.COMPLETE), now, out)
+            return
+        if self._commands.paused_at is not None:
+            if self._standing_since == math.inf:
+                self._standing_since, self.phase, self._clock_at = now, "standstill", now
             return
         for agent, turn in self._open.items():
             if agent not in self._choices:
@@ -236,6 +272,9 @@ class WorldProtocol:
     def _drive(self, agent: int, turn: OpenTurn, now: float, out: list[ev.Effect]) -> None:
         """Ask, ask again, or give one turn up."""
         slot = self.members.slots[agent]
+        if agent in self._commands.drained and turn.turn is None:
+            self._choices[agent] = ev.Choice(agent, IDLE, ev.Outcome.ABSENT)
+            return
         if not slot.present:
             if self._waits_for(turn, now):
                 return
@@ -290,6 +329,7 @@ class WorldProtocol:
             news = wire.News(run=self._run, epoch=self._epoch, channel=channel, sequence=sequence, payload=payload)
             self._news[channel] = news
             out.append(ev.Put(channel, news))
+        self._poll_at = -math.inf if event.requests or event.over else now + self.rules.poll
         if event.tick != self._tick:
             self._tick, self._clock_at = event.tick, now
             self._begin_tick()

@@ -11,20 +11,23 @@ from collections.abc import Sequence
 from typing import Any
 
 from marl_sched.comms.protocol import keys
-from marl_sched.comms.security.identity import OBSERVER
+from marl_sched.comms.security.identity import OBSERVER, OPERATOR
 
 _SUBSCRIBE = ["declare_subscriber"]
 _WATCH = ["declare_liveliness_subscriber", "liveliness_query"]
 
 
 def named_rules(run: str, prefix: str, channels: Sequence[Sequence[str]]) -> dict[str, Any]:
-    """Access rules for agents `<prefix>_<i>`, who may hear `channels[i]`, and for observers, by certificate."""
+    """Access rules for agents `<prefix>_<i>`, who may hear `channels[i]`, observers and operators, by certificate."""
     rules = _Rules(keys.run_prefix(run))
     for agent, heard in enumerate(channels):
         rules.add_agent(f"{prefix}_{agent}", keys.AgentKeys(prefix), str(agent), heard)
     rules.add(OBSERVER, "hear", "ingress", _SUBSCRIBE, [keys.CLOCK, keys.OBSERVED])
     rules.add(OBSERVER, "told", "egress", ["put"], [keys.CLOCK, keys.OBSERVED])
     rules.add_hub(OBSERVER)
+    rules.add(OPERATOR, "order", "ingress", ["query"], [keys.COMMAND])
+    rules.add(OPERATOR, "answered", "egress", ["reply"], [keys.COMMAND])
+    rules.add_hub(OPERATOR)
     return rules.section()
 
 

@@ -21,7 +21,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, load_pem_private_key
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from marl_sched.comms.security.identity import AUTHORITY, OBSERVER, WORLD
+from marl_sched.comms.security.identity import AUTHORITY, OBSERVER, OPERATOR, WORLD
 from marl_sched.errors import InvalidFileError, InvalidOptionError
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
@@ -30,7 +30,9 @@ _NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 
 
 def make_certificates(folder: Path, names: Sequence[str], *, hosts: Sequence[str] = (), days: int = DAYS) -> list[str]:
-    """Certificates for `names`, `world` and `observer`, signed by the folder's authority; it is made if there is none.
+    """Certificates for `names`, `world`, `observer` and `operator`, signed by the folder's authority.
+
+    The authority is made if there is none.
 
     `hosts` are further addresses or names by which agents reach the world; those of loopback are always in its
     certificate. A certificate that is there already stays as it is. The names of those that were made.
@@ -47,7 +49,7 @@ def make_certificates(folder: Path, names: Sequence[str], *, hosts: Sequence[str
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     authority = _Authority.load(folder) if (folder / f"{AUTHORITY}.pem").exists() else _Authority.make(folder, days)
     made = []
-    for name in dict.fromkeys((WORLD, OBSERVER, *names)):
+    for name in dict.fromkeys((WORLD, OBSERVER, OPERATOR, *names)):
         if (folder / f"{name}.pem").exists():
             continue
         authority.issue(folder, name, addresses if name == WORLD else [], days)

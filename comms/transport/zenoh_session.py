@@ -185,7 +185,7 @@ def hub(
     """
     _check_encryption(endpoint, identity)
     rules = open_rules(run, prefix) if identity is None else named_rules(run, prefix, channels)
-    config = _config(endpoint, lease, identity, mode="peer", listen={"endpoints": [endpoint]}, access_control=rules)
+    config = config_of(endpoint, lease, identity, mode="peer", listen={"endpoints": [endpoint]}, access_control=rules)
 
     def connect() -> zenoh.Session:
         try:
@@ -238,7 +238,7 @@ def _connect(endpoint: str, seconds: float, lease: float, identity: Identity | N
     timeout_ms = max(int(seconds * 1000), 1)
     connect = {"endpoints": [endpoint], "timeout_ms": timeout_ms, "exit_on_failure": True, "retry": retry}
     try:
-        return zenoh.open(_config(endpoint, lease, identity, mode="client", connect=connect))
+        return zenoh.open(config_of(endpoint, lease, identity, mode="client", connect=connect))
     except zenoh.ZError as error:
         return error
 
@@ -278,7 +278,8 @@ def _plain(error: zenoh.ZError) -> str:
     return re.sub(r" at /\S+:\d+\.?", "", str(error)).strip()
 
 
-def _config(endpoint: str, lease: float, identity: Identity | None, **sections: Any) -> zenoh.Config:
+def config_of(endpoint: str, lease: float, identity: Identity | None, **sections: Any) -> zenoh.Config:
+    """A session's configuration: explicit endpoints, no scouting, no shared memory, nothing that blocks a sender."""
     queue = {"size": {"data": QUEUE}, "congestion_control": {"drop": {"wait_before_drop": DROP_AFTER_US}}}
     link: dict[str, Any] = {
         "tx": {"lease": int(lease * 1000), "queue": queue},

@@ -16,7 +16,9 @@ the simulator's observation to the last bit.
 from __future__ import annotations
 
 import re
-from typing import Annotated, Any, TypeVar
+from collections.abc import Callable, Collection, Sequence
+from operator import itemgetter
+from typing import Annotated, Any, TypeVar, cast
 
 import msgspec
 import numpy as np
@@ -72,6 +74,12 @@ class PlaneStatus(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_f
 
 
 _SEEN = tuple(name for name in PlaneStatus.__struct_fields__ if name not in ("slot", "in_hand"))
+_TOLD = np.dtype(
+    [
+        (name, PLANE.fields[name][0] if PLANE.fields and name in PLANE.fields else np.int64)
+        for name in PlaneStatus.__struct_fields__
+    ]
+)
 
 
 class Sector(_Payload, tag="airme.sector.1", frozen=True):
@@ -105,6 +113,7 @@ class Memory(_Payload, tag="airme.memory.1", frozen=True):
 
 
 P = TypeVar("P", bound=_Payload)
+Which = Sequence[int] | None  # sectors or crews, None: all
 _encode = msgspec.msgpack.Encoder().encode
 
 
@@ -115,24 +124,30 @@ def _decode(payload: bytes, kind: type[P]) -> P:
         raise InvalidMessageError(f"not a message of type {kind.__struct_config__.tag}: {error}") from error
 
 
-def _statuses(planes: np.ndarray, slots: range, with_chosen: bool) -> list[PlaneStatus]:
-    """Planes, PLANE (P + 1,), as they go on the wire; a choice of this hour is told only `with_chosen`."""
-    statuses = []
-    for slot, values in zip(slots, planes[slots.start : slots.stop : slots.step].tolist(), strict=True):
-        plane = dict(zip(PLANE.names or (), values, strict=True))
-        chosen = CHOSEN if with_chosen and plane["chosen"] >= 0 else NOBODY
-        in_hand = REPAIRED if plane["crew"] >= 0 else chosen
-        statuses.append(PlaneStatus(slot=slot, in_hand=in_hand, **{name: plane[name] for name in _SEEN}))
-    return statuses
+def _statuses(planes: np.ndarray, slots: np.ndarray, *, with_chosen: bool) -> list[PlaneStatus]:
+    """The planes, PLANE (P + 1,), in those slots as they go on the wire; a choice of this hour only `with_chosen`.
 
-
-def _restore(planes: np.ndarray, status: PlaneStatus) -> None:
-    """Write a status into planes, PLANE (P + 1,). Who has it in hand stays unknown: crew 0 stands for anybody."""
-    plane = planes[status.slot]
+    Plain tuples stand for the structs, which encode alike: there are hundreds of them every hour.
+    """
+    chosen, told = planes[slots], np.empty(len(slots), _TOLD)
     for name in _SEEN:
-        plane[name] = getattr(status, name)
-    plane["crew"] = 0 if status.in_hand == REPAIRED else -1
-    plane["chosen"] = 0 if status.in_hand == CHOSEN else -1
+        told[name] = chosen[name]
+    told["slot"] = slots
+    told["in_hand"] = np.where((chosen["chosen"] >= 0) & with_chosen, CHOSEN, NOBODY)
+    told["in_hand"][chosen["crew"] >= 0] = REPAIRED
+    return cast(list[PlaneStatus], told.tolist())
+
+
+def _restore(planes: np.ndarray, statuses: Sequence[PlaneStatus]) -> None:
+    """Write statuses into planes, PLANE (P + 1,). Who has one in hand stays unknown: crew 0 stands for anybody."""
+    for status in statuses:
+        told = dict(zip(PlaneStatus.__struct_fields__, msgspec.structs.astuple(status), strict=True))
+        told["crew"] = 0 if status.in_hand == REPAIRED else -1
+        told["chosen"] = 0 if status.in_hand == CHOSEN else -1
+        planes[status.slot] = _in_order(told)  # a record in one piece: field by field it takes ten times as long
+
+
+_in_order = itemgetter(*(PLANE.names or ()))
 
 
 def _sector_slots(sector: int, n_planes: int, n_crews: int) -> range:
@@ -161,26 +176,20 @@ class AirmeTelemetry:
             )
         )
 
-    def messages(self, simulator: AirmeSimulator) -> dict[str, bytes]:
-        """Every sector now and delayed, every crew's status and memory."""
-        state, staleness = simulator.state, int(simulator.limits[0, 2])
-        n_planes, n_crews = int(state.rows[0]["n_planes"]), int(state.rows[0]["n_crews"])
-        now = int(state.rows[0]["time"])
-        snapshot_hour = max(0, now - staleness)
+    def messages(self, simulator: AirmeSimulator, channels: Collection[str] | None = None) -> dict[str, bytes]:
+        """Every sector now and delayed, every crew's status and memory; only `channels` if they are given."""
         said: dict[str, bytes] = {}
-        for sector in range(n_crews):
-            slots = _sector_slots(sector, n_planes, n_crews)
-            planes = _statuses(state.planes[0], slots, with_chosen=False)
-            said[f"plane/{sector}/now"] = _encode(Sector(hour=now, planes=planes))
-            if staleness:
-                planes = _statuses(state.past[0, snapshot_hour % state.past.shape[1]], slots, with_chosen=False)
-                said[f"plane/{sector}/delayed"] = _encode(Sector(hour=snapshot_hour, planes=planes))
-        for crew in range(n_crews):
-            record = {name: int(state.crews[0, crew][name]) for name in CREW.names or ()}
-            said[f"crew/{crew}/status"] = _encode(CrewStatus(hour=now, **record))
-            if staleness:
-                said[f"crew/{crew}/memory"] = _encode(_memory(state, crew, snapshot_hour))
+        for kind, write in _WRITERS.items():
+            if channels is None:
+                said |= write(simulator, None)
+            elif chosen := [int(match[1]) for c in channels if (match := kind.fullmatch(c))]:
+                said |= write(simulator, sorted(chosen))
         return said
+
+    def turn_channels(self, simulator: AirmeSimulator, agent: int) -> list[str]:
+        """What a crew chose, and what it learnt if that was impossible; planes change when the hour passes."""
+        channels = [f"crew/{agent}/status"]
+        return [*channels, f"crew/{agent}/memory"] if simulator.limits[0, 2] else channels
 
     def series(self, simulator: AirmeSimulator) -> dict[str, list[float]]:
         """Profit, revenue and availability of every hour so far."""
@@ -192,11 +201,63 @@ class AirmeTelemetry:
         return AirmeLocalState(_decode(frame, Frame), agent)
 
 
-def _memory(state: State, crew: int, snapshot_hour: int) -> Memory:
-    kept = [int(slot) for slot in np.flatnonzero(state.private_memory_at[0, crew] >= snapshot_hour)]
-    hours = state.private_memory_at[0, crew, kept].tolist()
-    planes = [_statuses(state.private_memory[0, crew], range(slot, slot + 1), with_chosen=True)[0] for slot in kept]
-    return Memory(planes=[KnownPlane(hour, plane) for hour, plane in zip(hours, planes, strict=True)])
+def _sectors(planes: np.ndarray, hour: int, age: str, simulator: AirmeSimulator, which: Which) -> dict[str, bytes]:
+    """The payloads of sectors, all if `which` is None, as they were at the start of `hour`."""
+    row = simulator.state.rows[0]
+    n_planes, n_crews = int(row["n_planes"]), int(row["n_crews"])
+    told = _statuses(planes, np.arange(1, n_planes + 1), with_chosen=False)
+    sectors = range(n_crews) if which is None else which
+    return {f"plane/{s}/{age}": _encode(Sector(hour=hour, planes=told[s::n_crews])) for s in sectors}
+
+
+def _now(simulator: AirmeSimulator, which: Which) -> dict[str, bytes]:
+    return _sectors(simulator.state.planes[0], int(simulator.time[0]), "now", simulator, which)
+
+
+def _delayed(simulator: AirmeSimulator, which: Which) -> dict[str, bytes]:
+    if not simulator.limits[0, 2]:
+        return {}
+    hour, past = _snapshot_hour(simulator), simulator.state.past
+    return _sectors(past[0, hour % past.shape[1]], hour, "delayed", simulator, which)
+
+
+def _crew_statuses(simulator: AirmeSimulator, which: Which) -> dict[str, bytes]:
+    hour, crews = int(simulator.time[0]), simulator.state.crews[0]
+    said = {}
+    for crew in range(int(simulator.n_agents[0])) if which is None else which:
+        record = dict(zip(CREW.names or (), crews[crew].item(), strict=True))
+        said[f"crew/{crew}/status"] = _encode(CrewStatus(hour=hour, **record))
+    return said
+
+
+def _memories(simulator: AirmeSimulator, which: Which) -> dict[str, bytes]:
+    if not simulator.limits[0, 2]:
+        return {}
+    state, said = simulator.state, {}
+    hours = state.private_memory_at[0, : int(simulator.n_agents[0])]
+    kept = np.asarray(hours >= _snapshot_hour(simulator))
+    knowing = set(np.nonzero(kept)[0].tolist())
+    for crew in range(len(hours)) if which is None else which:
+        planes: list[KnownPlane] = []
+        if crew in knowing:
+            slots = np.flatnonzero(kept[crew])
+            told = _statuses(state.private_memory[0, crew], slots, with_chosen=True)
+            planes = [KnownPlane(*pair) for pair in zip(hours[crew, slots].tolist(), told, strict=True)]
+        said[f"crew/{crew}/memory"] = _encode(Memory(planes=planes))
+    return said
+
+
+def _snapshot_hour(simulator: AirmeSimulator) -> int:
+    """The hour that delayed snapshots are of."""
+    return max(0, int(simulator.time[0]) - int(simulator.limits[0, 2]))
+
+
+_WRITERS: dict[re.Pattern[str], Callable[[AirmeSimulator, Which], dict[str, bytes]]] = {
+    re.compile(r"plane/(\d+)/now"): _now,
+    re.compile(r"plane/(\d+)/delayed"): _delayed,
+    re.compile(r"crew/(\d+)/status"): _crew_statuses,
+    re.compile(r"crew/(\d+)/memory"): _memories,
+}
 
 
 class AirmeLocalState:
@@ -244,8 +305,7 @@ class AirmeLocalState:
             raise InvalidMessageError(f"sector {sector}: expected the planes in slots {slots}")
         self._check(said.planes)
         planes = state.planes[0] if now else state.past[0, said.hour % (frame.staleness + 1)]
-        for plane in said.planes:
-            _restore(planes, plane)
+        _restore(planes, said.planes)
 
     def _hear_crew(self, crew: int, said: CrewStatus) -> None:
         if max(said.plane, said.choice) > self._frame.n_planes:
@@ -259,9 +319,9 @@ class AirmeLocalState:
     def _hear_memory(self, said: Memory) -> None:
         self._check([told.plane for told in said.planes])
         told, told_at = self._state.private_memory[0, self._agent], self._state.private_memory_at[0, self._agent]
+        _restore(told, [item.plane for item in said.planes])
         told_at[:] = -1
         for item in said.planes:
-            _restore(told, item.plane)
             told_at[item.plane.slot] = item.hour
 
     def _check(self, planes: list[PlaneStatus]) -> None:
@@ -275,6 +335,9 @@ class AirmeLocalState:
         agents = np.array([self._agent], np.int64)
         graph.observe(self._state, self._usage, agents, self._limits, out)
         return self._observation
+
+    def simulator(self) -> None:
+        """No scheduler of AirME plans from a whole state."""
 
 
 def _empty_state(frame: Frame) -> State:

@@ -46,6 +46,7 @@ MURSE = Domain(
     impossibilities=MurseInstance.impossibilities,
     instance_files=instance_files,
     episode_figure=lazy("marl_sched.envs.murse.render:episode_figure"),
+    telemetry=lazy("marl_sched.envs.murse.telemetry:TELEMETRY"),
     save_schedules=lazy("marl_sched.envs.murse.schedule:save_schedules"),
     schedules=lazy("marl_sched.envs.murse.schedule_files:SCHEDULES"),
     solver_bound=lazy("marl_sched.agents.murse.schedulers:SOLVER_BOUND"),

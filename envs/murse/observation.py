@@ -37,7 +37,7 @@ from marl_sched.envs.murse.graph import (
     Arrays,
 )
 from marl_sched.envs.murse.instance import NO_DEADLINE
-from marl_sched.envs.murse.lookahead import new_outlook, see_ahead
+from marl_sched.envs.murse.lookahead import Outlook, new_outlook, see_ahead
 from marl_sched.envs.murse.network import network_of, simplified_bounds
 from marl_sched.envs.murse.rules import Rules
 from marl_sched.envs.murse.state import NEVER, NOBODY, State
@@ -61,15 +61,31 @@ def observe(state: State, rules: Rules, agents: np.ndarray, sensing: float, comm
         if viewer < 0:
             continue
         survey(state, rules, b, viewer, sensing, comm, sight)
-        see_agents(state, b, viewer, sight, out)
-        startable = see_tasks(state, b, viewer, sight, out)
-        see_durations(state, b, sight, out)
-        see_locations(state, b, sight, out)
-        see_network(state, b, sight, out)
-        summarise(state, b, sight, out)
-        if state.agents[b, viewer].free_at <= state.rows[b].clock and state.rows[b].acting != NOBODY:
-            write_action_mask(startable, b, out)
-        see_ahead(state, b, viewer, sight, outlook, out)
+        describe(state, b, viewer, sight, outlook, out)
+
+
+@kernel(error_model="numpy")
+def observe_known(state: State, viewer: int, sight: Sight, out: Arrays) -> None:
+    """Write what an agent sees that was told `sight` of the only row, as `observe` writes what it surveys by itself."""
+    for b in range(len(out.time)):  # not a literal 0, for which everything would be compiled again
+        clear(out, b)
+        out.action_mask[b, 0] = 1
+        out.time[b] = state.rows[b].time
+        describe(state, b, viewer, sight, new_outlook(state), out)
+
+
+@kernel(error_model="numpy")
+def describe(state: State, b: int, viewer: int, sight: Sight, outlook: Outlook, out: Arrays) -> None:
+    """Write what a viewer knows into row b, which has been cleared."""
+    see_agents(state, b, viewer, sight, out)
+    startable = see_tasks(state, b, viewer, sight, out)
+    see_durations(state, b, sight, out)
+    see_locations(state, b, sight, out)
+    see_network(state, b, sight, out)
+    summarise(state, b, sight, out)
+    if state.agents[b, viewer].free_at <= state.rows[b].clock and state.rows[b].acting != NOBODY:
+        write_action_mask(startable, b, out)
+    see_ahead(state, b, viewer, sight, outlook, out)
 
 
 @kernel

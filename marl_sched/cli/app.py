@@ -20,6 +20,7 @@ from marl_sched.cli import (
     deployment,
     evaluation,
     information,
+    ordering,
     pages,
     problems,
     schedules,
@@ -37,7 +38,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 _GROUPS = (
-    problems, sheets, advice, schedules, evaluation, pages, bound, training, deployment, chaos, demo, information,
+    problems, sheets, advice, schedules, evaluation, pages, bound, training, deployment, ordering, chaos, demo,
+    information,
 )  # fmt: skip
 for group in _GROUPS:
     group.add_to(app)

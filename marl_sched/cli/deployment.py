@@ -74,6 +74,10 @@ class Plant:
     seed: options.Seed = 0
     objective: options.Objective = None
     view: options.View = "full"
+    plant_factory: Annotated[
+        str,
+        typer.Option("--plant", metavar="PACKAGE.MODULE:FUNCTION", help="What makes a plant (default: the simulator)."),
+    ] = ""
     run: Annotated[str, typer.Option("--run", help="The run's name, by which its processes find each other.")] = "run"
     certs: Certs = None
     insecure: Annotated[
@@ -131,6 +135,7 @@ class Plant:
         options.check_output(json)
         return WorldOptions(
             problem=self.problem(),
+            plant_factory=self.plant_factory,
             run=self.run,
             listen=listen,
             certs=str(self.certs or ""),
@@ -397,7 +402,7 @@ def print_report(report: RunReport) -> None:
     latency, messages = report.latency_ms, report.messages
     if report.ending.kind != "complete":
         typer.echo(f"the run did not come to its end: {report.ending.reason}")
-    typer.echo(f"{report.time} {report.unit}, {len(report.agents)} agents, {len(report.decisions)} decisions")
+    typer.echo(f"{report.progress} {report.unit}, {len(report.agents)} agents, {len(report.decisions)} decisions")
     typer.echo(f"M1 ({report.objective}): {report.M1:.4f}")
     _print_shares(report.agents)
     if report.from_log is not None:

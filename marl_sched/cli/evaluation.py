@@ -166,12 +166,21 @@ def bench(
         Path | None,
         typer.Option("--against", metavar="FILE", help="Earlier figures; ends with 1 if one is 10 percent slower."),
     ] = None,
+    deployed: Annotated[
+        str | None,
+        typer.Option("--deployed", metavar="RULE", help="Measure instead what turns of processes of this rule cost."),
+    ] = None,
+    scale: options.Scale = None,
 ) -> None:
     """Measure how fast the simulator, its environment APIs and the policy are on this machine, on one thread.
 
     `--against` holds the figures against those that `--json` wrote before, each in units of a calibration that is
-    measured beside them, so that the machines need not be the same.
+    measured beside them, so that the machines need not be the same. `--deployed` plays a run of `--scale` as processes
+    under the local view, beside a bare exchange over Zenoh of the same telemetry by as many processes.
     """
+    if deployed is not None:
+        _bench_deployment(env, scale, deployed, json)
+        return
     from marl_sched.cli.tables import print_bench
     from marl_sched.domain import get_domain
     from marl_sched.files import STDOUT, write_json
@@ -187,3 +196,20 @@ def bench(
         write_json(json, msgspec.to_builtins(now))
     if earlier is not None and any(ratio > SLOWER for ratio in now.against(earlier).values()):
         raise typer.Exit(BECAME_SLOWER)
+
+
+def _bench_deployment(env: str, scale: str | None, rule: str, json: Path | None) -> None:
+    from marl_sched.comms.bench import measure
+    from marl_sched.comms.options import WorldOptions
+    from marl_sched.domain import get_domain
+    from marl_sched.files import write_json
+    from marl_sched.problem import Problem
+
+    view = next((kind for kind, view in get_domain(env).views.items() if view().hides), None)
+    problem = Problem(env, scale=scale, count=1, view=view)
+    with told_of_compilation():
+        figures = measure(WorldOptions(problem=problem, listen="tcp/127.0.0.1:0", insecure=True, deadline=30.0), rule)
+    for name, value in msgspec.to_builtins(figures).items():
+        typer.echo(f"{name:>14}  {value}")
+    if json is not None:
+        write_json(json, msgspec.to_builtins(figures))

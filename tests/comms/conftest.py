@@ -19,15 +19,18 @@ def played_in_process(options: WorldOptions, policies: list[str]) -> dict[str, A
     """What the simulator and the schedulers alone make of a run: decisions, rewards and M1 as in the report."""
     simulator, domain = options.simulator(), options.domain
     schedulers = [create_scheduler(policy, domain) for policy in policies]
-    decisions, rewards = [], []
+    for scheduler in schedulers:
+        scheduler.start(simulator, np.ones(1, np.bool_))
+    decisions, rewards, time_unit = [], [], options.telemetry().time_unit
     while not simulator.over[0]:
-        hour, agent = int(simulator.time[0]), int(simulator.acting[0])
+        time, agent = int(simulator.time[0]), int(simulator.acting[0])
         action = schedulers[agent].decide(simulator)
         simulator.step(action)
         outcome = "conflict" if simulator.conflict[0] else "decided"
-        decisions.append({"hour": hour, "agent": f"crew_{agent}", "action": int(action[0]), "outcome": outcome})
+        name = domain.agent_name(agent)
+        decisions.append({time_unit: time, "agent": name, "action": int(action[0]), "outcome": outcome})
         rewards.append(float(simulator.reward[0]))
-    m1 = float(np.float64(simulator.objectives()["profit"][0]))
+    m1 = float(simulator.objectives()[options.problem.objective][0])
     return {"decisions": decisions, "rewards": rewards, "M1": m1}
 
 

@@ -15,13 +15,14 @@ from marl_sched.comms.options import AgentOptions, DeployOptions, WorldOptions
 from marl_sched.comms.security.certificates import agent_names, make_certificates
 from marl_sched.comms.security.identity import Identity
 from marl_sched.errors import InvalidFileError, InvalidOptionError
+from marl_sched.problem import Problem
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
     made = tmp_path_factory.mktemp("certs") / "run"
     assert make_certificates(made, ["crew_0", "crew_1"], hosts=["plant.local", "10.0.0.5"]) == [
-        "world", "observer", "crew_0", "crew_1",
+        "world", "observer", "operator", "crew_0", "crew_1",
     ]  # fmt: skip
     return made
 
@@ -72,7 +73,7 @@ def test_agents_certificate_cannot_serve_nor_the_worlds_at_another_address(folde
 def test_private_keys_are_their_owners_alone(folder):
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
     keys = sorted(folder.glob("*.key"))
-    assert [key.stem for key in keys] == ["ca", "crew_0", "crew_1", "observer", "world"]
+    assert [key.stem for key in keys] == ["ca", "crew_0", "crew_1", "observer", "operator", "world"]
     assert {stat.S_IMODE(key.stat().st_mode) for key in keys} == {0o600}
 
 
@@ -107,19 +108,22 @@ def test_names_hosts_and_days_that_cannot_be_are_refused(tmp_path):
     assert not (tmp_path / "none").exists()
 
 
+AIRME = Problem("airme", count=1)
+
+
 def test_process_finds_its_own_certificate_or_says_what_lacks(folder, tmp_path):
     agent = AgentOptions(agent=1, policy="random", certs=str(folder))
     assert agent.identity() == Identity(folder, "crew_1")
     with pytest.raises(InvalidOptionError, match=r"one certificate of agent 5, such as crew_5\.pem, found none"):
         AgentOptions(agent=5, policy="random", certs=str(folder)).identity()
     with pytest.raises(InvalidOptionError, match=r"ca\.pem: there is no such file; `marl-sched certs"):
-        WorldOptions(env="airme", certs=str(tmp_path)).identity()
+        WorldOptions(problem=AIRME, certs=str(tmp_path)).identity()
 
 
 def test_listening_without_certificates_wants_a_word():
     with pytest.raises(InvalidOptionError, match=r"tcp/0\.0\.0\.0:1 is reached by other machines.*--insecure"):
-        WorldOptions(env="airme", listen="tcp/0.0.0.0:1")
+        WorldOptions(problem=AIRME, listen="tcp/0.0.0.0:1")
     with pytest.raises(InvalidOptionError, match=r"whoever reaches it can answer in an agent's name.*--insecure"):
-        DeployOptions(world=WorldOptions(env="airme", listen="tcp/127.0.0.1:0"), policy="random")
-    WorldOptions(env="airme", listen="tls/0.0.0.0:1")
-    DeployOptions(world=WorldOptions(env="airme", listen="tcp/127.0.0.1:0", insecure=True), policy="random")
+        DeployOptions(world=WorldOptions(problem=AIRME, listen="tcp/127.0.0.1:0"), policy="random")
+    WorldOptions(problem=AIRME, listen="tls/0.0.0.0:1")
+    DeployOptions(world=WorldOptions(problem=AIRME, listen="tcp/127.0.0.1:0", insecure=True), policy="random")

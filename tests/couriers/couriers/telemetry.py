@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -51,8 +52,8 @@ class CouriersTelemetry:
             )
         )
 
-    def messages(self, simulator: CouriersSimulator) -> dict[str, bytes]:
-        """Every job and every courier as it is."""
+    def messages(self, simulator: CouriersSimulator, channels: Collection[str] | None = None) -> dict[str, bytes]:
+        """Every job and every courier as it is, or those of `channels` alone."""
         said: dict[str, bytes] = {}
         day, present = int(simulator.time[0]), int(simulator.jobs["there"][0].sum())
         for j in range(1, len(simulator.instances[0].jobs) + 1):
@@ -61,7 +62,11 @@ class CouriersTelemetry:
         for c in range(int(simulator.n_agents[0])):
             values = [int(value) for value in simulator.couriers[0, c].item()]
             said[f"courier/{c}/status"] = msgspec.msgpack.encode(Said(day=day, present=present, values=values))
-        return said
+        return {channel: payload for channel, payload in said.items() if channels is None or channel in channels}
+
+    def turn_channels(self, simulator: CouriersSimulator, agent: int) -> list[str]:
+        """What a courier chose; jobs are taken at the end of the day."""
+        return [f"courier/{agent}/status"]
 
     def series(self, simulator: CouriersSimulator) -> dict[str, list[float]]:
         """Nothing is kept day by day."""
@@ -106,6 +111,9 @@ class CouriersLocalState:
         arrays = {name: array[0, ...] for name, array in out.items()}
         graph.write(self._jobs, self._couriers, self._day, self._agent, self._frame.reach, self._present, arrays)
         return out
+
+    def simulator(self) -> None:
+        """No scheduler of couriers plans from a whole state."""
 
 
 def _decode(payload: bytes, kind: type) -> msgspec.Struct:
