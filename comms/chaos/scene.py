@@ -28,6 +28,7 @@ from marl_sched.errors import MarlSchedError
 POLL = 0.02  # seconds between two looks
 START_TICK = 20  # the first faults come when the run has come so far
 PATIENCE = 240.0  # seconds after which a run that does not go on has failed
+STEADY = 2.0  # seconds for which agents that were heard again must stay so
 PRESENT = ("ready", "asked")
 
 
@@ -115,16 +116,26 @@ class Scene:
             self.look()
 
     def heard_again(self) -> None:
-        """Wait until the world has heard every agent after this moment, and note how long that took."""
+        """Wait until the world has heard every agent after this moment and time goes on, and note how long that took.
+
+        What a link had held back is heard too, so it must stay so for STEADY seconds.
+        """
         ended = time.monotonic()
+        before = (self.seen.epoch, self.seen.decisions) if self.seen is not None else ("", 0)
 
         def heard() -> bool:
-            if self.seen is None or self.seen_at <= ended:
+            seen = self.seen
+            if seen is None or self.seen_at <= ended or (seen.epoch, seen.decisions) == before:
                 return False
-            return all(a.state in PRESENT and self.seen_at - a.silent > ended for a in self.seen.agents)
+            return all(agent.state in PRESENT and self.seen_at - agent.silent > ended for agent in seen.agents)
 
-        self.until(heard, "hear every agent again")
-        self.heard_s = max(self.heard_s or 0.0, time.monotonic() - ended)
+        again: float | None = None
+        while again is None or time.monotonic() < again + STEADY:
+            if not heard():
+                self.until(heard, "hear every agent again")
+                again = time.monotonic()
+            self.look()
+        self.heard_s = max(self.heard_s or 0.0, again - ended)
 
     # ---- what is done to it
 
