@@ -21,7 +21,10 @@ FILES = sorted(
     if str(path.relative_to(ROOT)) not in REGISTRATION
     and not path.name.startswith(tuple(f"{name}_v" for name in DOMAINS))
 )
-NAMES = re.compile("|".join(DOMAINS), re.IGNORECASE)
+# A name counts as a word of its own, of snake_case or CamelCase: `ward` is in `WardSimulator` and not in `forward`.
+NAMES = re.compile(
+    "|".join(f"(?<![A-Za-z])(?i:{name})(?![a-z])|(?<=[a-z]){name.capitalize()}(?![a-z])" for name in DOMAINS)
+)
 
 
 def named(source: str) -> list[str]:
@@ -53,3 +56,11 @@ def test_a_name_in_code_would_be_seen_and_one_in_a_docstring_not():
     assert named(f'"""Like {first}."""\nenv = \'{first}\'\n') == [first]
     assert named(f"fleet = 3  # of {first}\n") == [f"# of {first}"]
     assert named(f"import marl_sched.envs.{first}.views\n") == [f"marl_sched.envs.{first}.views"]
+
+
+@pytest.mark.parametrize("name", DOMAINS)
+def test_a_name_is_seen_as_a_word_of_an_identifier_and_not_within_one(name):
+    title = name.capitalize()
+    for code in (name, f"{name}_v0", f"{title}Simulator", f"My{title}", f"make_{name}", name.upper()):
+        assert named(f"{code} = 1\n") == [code]
+    assert named(f"for{name} = re{name}ing = 1\n") == []
