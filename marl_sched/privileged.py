@@ -21,6 +21,7 @@ class PrivilegedInfo(Flag):
     WAITS = auto()
     DEADLINES = auto()
     PLACES = auto()
+    ARRIVALS = auto()
 
     def __str__(self) -> str:
         """The parts in words, such as "failure model and clock"; "" for nothing."""
@@ -58,4 +59,5 @@ _IN_WORDS = {
     PrivilegedInfo.WAITS: "waits",
     PrivilegedInfo.DEADLINES: "deadlines",
     PrivilegedInfo.PLACES: "places",
+    PrivilegedInfo.ARRIVALS: "arrivals",
 }
