@@ -5,4 +5,5 @@
 DOMAINS = {
     "airme": "marl_sched.envs.airme.domain:AIRME",
     "murse": "marl_sched.envs.murse.domain:MURSE",
+    "ward": "marl_sched.envs.ward.domain:WARD",
 }

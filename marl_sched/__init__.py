@@ -1,4 +1,4 @@
-"""Schedulers that decide for themselves: aircraft maintenance (AirME) and human-robot teams (MuRSE).
+"""Schedulers that decide for themselves: aircraft maintenance (AirME), human-robot teams (MuRSE), a delivery ward.
 
     import marl_sched
 
@@ -20,14 +20,15 @@ from marl_sched.gymnasium_ids import register as _register
 if TYPE_CHECKING:
     from marl_sched import airme_v0 as airme_v0
     from marl_sched import murse_v0 as murse_v0
+    from marl_sched import ward_v0 as ward_v0
     from marl_sched.agents import load_policy as load_policy
 
     __version__: str
 
-_MODULES = ("airme_v0", "murse_v0")
+_MODULES = ("airme_v0", "murse_v0", "ward_v0")
 _ATTRIBUTES = {"load_policy": "marl_sched.agents"}
 
-__all__ = ["__version__", "airme_v0", "load_policy", "murse_v0"]
+__all__ = ["__version__", "airme_v0", "load_policy", "murse_v0", "ward_v0"]
 
 
 def __getattr__(name: str) -> Any:

@@ -13,7 +13,7 @@ import gymnasium
 from marl_sched.plugins import DOMAINS as ENTRY_POINTS
 from marl_sched.plugins import offered
 
-DOMAINS = {"marl_sched/AirME-v0": "airme", "marl_sched/MuRSE-v0": "murse"}
+DOMAINS = {"marl_sched/AirME-v0": "airme", "marl_sched/MuRSE-v0": "murse", "marl_sched/Ward-v0": "ward"}
 
 
 def register() -> None:

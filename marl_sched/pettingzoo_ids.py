@@ -10,7 +10,11 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 
-PAGES = {"marl_sched/AirME-v0": "marl_sched.airme_v0", "marl_sched/MuRSE-v0": "marl_sched.murse_v0"}
+PAGES = {
+    "marl_sched/AirME-v0": "marl_sched.airme_v0",
+    "marl_sched/MuRSE-v0": "marl_sched.murse_v0",
+    "marl_sched/Ward-v0": "marl_sched.ward_v0",
+}
 
 
 def register() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from marl_sched.domain import Domain, get_domain
 
-DOMAINS = ("airme", "murse")
+DOMAINS = ("airme", "murse", "ward")
 
 # A Dict observation with an action mask, which PettingZoo's own documentation recommends, raises these two.
 MASK_WARNINGS = (

@@ -6,7 +6,7 @@ import numpy as np
 
 from marl_sched.envs.airme.instance import AirmeInstance
 
-HORIZON = {"airme": 40, "murse": 2}  # hours, rounds
+HORIZON = {"airme": 40, "murse": 2, "ward": 4}  # hours, rounds, hours
 
 
 def fleet(n_planes, n_crews):

@@ -8,7 +8,7 @@ import pytest
 from marl_sched.envs.api.aec import SchedulingAEC
 from marl_sched.envs.api.gymnasium_env import SchedulingEnv
 
-HORIZON = {"airme": 60, "murse": 3}  # hours, rounds
+HORIZON = {"airme": 60, "murse": 3, "ward": 5}  # hours, rounds, hours
 SEED = 11
 ROW, BATCH = 17, 64
 

@@ -14,18 +14,23 @@ import numpy as np
 import pytest
 import torch
 
-from marl_sched import airme_v0, murse_v0
+from marl_sched import airme_v0, murse_v0, ward_v0
 from marl_sched.domain import get_domain
 from marl_sched.errors import InvalidOptionError
 from tests.envs.problems import HORIZON
 
-STALE = {"airme": {"kind": "local", "reach": 2, "comm": 1, "staleness": 3}, "murse": {"kind": "local"}}
+STALE = {
+    "airme": {"kind": "local", "reach": 2, "comm": 1, "staleness": 3},
+    "murse": {"kind": "local"},
+    "ward": {"kind": "local"},
+}
+IDS = {"airme": "marl_sched/AirME-v0", "murse": "marl_sched/MuRSE-v0", "ward": "marl_sched/Ward-v0"}
 COPIES = {
     "deepcopy": copy.deepcopy,
     "pickle": lambda thing: pickle.loads(pickle.dumps(thing)),  # noqa: S301 (written a line before)
     "cloudpickle": lambda thing: cloudpickle.loads(cloudpickle.dumps(thing)),
 }
-PAGES = {"airme": airme_v0, "murse": murse_v0}
+PAGES = {"airme": airme_v0, "murse": murse_v0, "ward": ward_v0}
 APIS = ("aec", "parallel", "gymnasium", "torchrl")
 
 
@@ -55,7 +60,7 @@ def make(domain, api):
         return env, play_torchrl
     options = {"horizon": HORIZON[domain.name]}
     if api == "gymnasium":
-        env = gymnasium.make({"airme": "marl_sched/AirME-v0", "murse": "marl_sched/MuRSE-v0"}[domain.name], **options)
+        env = gymnasium.make(IDS[domain.name], **options)
         env.reset(seed=1)
         return env, play_gymnasium
     options["view"] = STALE[domain.name]
@@ -223,14 +228,15 @@ def test_observations_in_arrays_of_other_shapes_are_refused(simulator):
 def test_kernels_refuse_arrays_that_do_not_belong_together(domain, simulator):
     from marl_sched.envs.airme import dynamics as airme
     from marl_sched.envs.murse import dynamics as murse
+    from marl_sched.envs.ward import dynamics as ward
 
-    kernels = {"airme": airme, "murse": murse}[domain.name]
+    kernels = {"airme": airme, "murse": murse, "ward": ward}[domain.name]
     targets = np.zeros(3, np.int64)
     with pytest.raises(ValueError, match="do not belong together"):
         kernels.step(simulator.state._replace(rows=simulator.state.rows[:2]), simulator.rules, targets)
     with pytest.raises(ValueError, match="do not belong together"):
         kernels.step(simulator.state, simulator.rules, targets[:2])
-    simulator.state.rows["n_agents" if domain.name == "murse" else "n_crews"][1] = 99
+    simulator.state.rows[{"airme": "n_crews", "murse": "n_agents", "ward": "n_nurses"}[domain.name]][1] = 99
     with pytest.raises(ValueError, match="does not fit into its arrays"):
         kernels.step(simulator.state, simulator.rules, targets)
 
@@ -251,7 +257,8 @@ def test_a_round_of_an_episode_that_is_over_is_refused():
 CHECKED = """
 import copy, numpy as np
 from marl_sched.domain import get_domain
-for name, views, horizon in (("airme", ("full", "local", "random"), 30), ("murse", ("full", "local"), 2)):
+plays = (("airme", ("full", "local", "random"), 30), ("murse", ("full", "local"), 2), ("ward", ("full", "local"), 4))
+for name, views, horizon in plays:
     domain = get_domain(name)
     for view in views:
         for pad in (None, "small"):

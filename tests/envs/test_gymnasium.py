@@ -14,7 +14,7 @@ from marl_sched.envs.api.gymnasium_env import SchedulingEnv
 from marl_sched.errors import IllegalActionError, InvalidOptionError, UnknownNameError
 from tests.envs.problems import HORIZON, fleet
 
-IDS = {"airme": "marl_sched/AirME-v0", "murse": "marl_sched/MuRSE-v0"}
+IDS = {"airme": "marl_sched/AirME-v0", "murse": "marl_sched/MuRSE-v0", "ward": "marl_sched/Ward-v0"}
 
 
 def make(domain, **options):

@@ -14,7 +14,7 @@ from marl_sched.envs.api.parallel import SchedulingParallel
 from marl_sched.errors import UnknownNameError
 from marl_sched.noise import SPLITS, episode_number, instance_generator
 
-IDS = {"airme": "marl_sched/AirME-v0", "murse": "marl_sched/MuRSE-v0"}
+IDS = {"airme": "marl_sched/AirME-v0", "murse": "marl_sched/MuRSE-v0", "ward": "marl_sched/Ward-v0"}
 
 
 def torchrl_env(domain, **options):
@@ -102,7 +102,7 @@ def test_environments_without_a_seed_are_not_alike(domain, make):
 def test_vectorised_environments_without_a_seed_are_not_alike(domain):
     envs = gymnasium.make_vec(IDS[domain.name], num_envs=4, vectorization_mode="sync", horizon=2)
     observations, _ = envs.reset()
-    name = "plane" if domain.name == "airme" else "task"
+    name = {"airme": "plane", "murse": "task", "ward": "patient"}[domain.name]
     assert len({observations[name][i].tobytes() for i in range(4)}) == 4
     first, _ = envs.reset(seed=3)
     again, _ = envs.reset(seed=3)

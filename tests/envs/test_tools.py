@@ -8,14 +8,14 @@ import gymnasium
 import numpy as np
 import pytest
 
-from marl_sched import airme_v0, murse_v0
+from marl_sched import airme_v0, murse_v0, ward_v0
 from marl_sched.envs.api.aec import SchedulingAEC
 from marl_sched.envs.api.gymnasium_env import SchedulingEnv
 from marl_sched.envs.api.parallel import SchedulingParallel
 from marl_sched.errors import UnknownNameError
 from tests.envs.problems import HORIZON
 
-PAGES = {"airme": airme_v0, "murse": murse_v0}
+PAGES = {"airme": airme_v0, "murse": murse_v0, "ward": ward_v0}
 
 
 @pytest.fixture(params=(SchedulingAEC, SchedulingParallel))
@@ -170,7 +170,7 @@ def test_the_mask_of_murses_joint_action_is_the_instances_tasks_and_agents(padde
 
 
 def test_registered_environments_take_the_flat_layout(domain):
-    name = {"airme": "marl_sched/AirME-v0", "murse": "marl_sched/MuRSE-v0"}[domain.name]
+    name = {"airme": "marl_sched/AirME-v0", "murse": "marl_sched/MuRSE-v0", "ward": "marl_sched/Ward-v0"}[domain.name]
     env = gymnasium.make(name, flat=True, horizon=2)
     assert env.get_wrapper_attr("action_masks")().shape == (env.action_space.nvec.sum(),)
 

@@ -22,7 +22,7 @@ ALLOWED = {
     "cli": {"core", "envs", "agents", "train", "comms", "configs", "cli"},
 }
 # Public modules that are a domain's environment API, and therefore stand on the room that holds it.
-FRONT_DOORS = {"marl_sched.airme_v0": "envs", "marl_sched.murse_v0": "envs"}
+FRONT_DOORS = {f"marl_sched.{page}": "envs" for page in ("airme_v0", "murse_v0", "ward_v0")}
 
 # What may need torch: the TorchRL environment, learned policies and training. Comparing rules does not.
 NEEDS_TORCH = (

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from marl_sched import airme_v0, murse_v0
+from marl_sched import airme_v0, murse_v0, ward_v0
 from marl_sched.domain import get_domain
 
 ROOT = Path(__file__).parents[2]
-PAGES = {"airme": airme_v0, "murse": murse_v0}
-OPTIONS = {"airme": airme_v0.AirmeOptions, "murse": murse_v0.MurseOptions}
+PAGES = {"airme": airme_v0, "murse": murse_v0, "ward": ward_v0}
+OPTIONS = {"airme": airme_v0.AirmeOptions, "murse": murse_v0.MurseOptions, "ward": ward_v0.WardOptions}
 
 
 def table_of(page):
