@@ -98,7 +98,7 @@ policy-murse-full-makespan: $(INSTALLED)
 	$(call trained,murse-full-costs,$(PLANNED) $(COSTS) updates=120 \
 		start_from=runs/murse-full-imitation/policy.safetensors)
 	$(call trained,murse-full-makespan,$(PLANNED) $(COSTS) validation.every=15 algorithm.temperature=0.003 \
-		algorithm.final_temperature=0.001 algorithm.epochs=1 updates=75 seed=1 \
+		algorithm.final_temperature=0.001 algorithm.epochs=1 updates=180 seed=1 \
 		start_from=runs/murse-full-costs/policy.safetensors)
 	$(BIN)/marl-sched export runs/murse-full-makespan murse-full-makespan --out agents/policies/shipped \
 		--scales small,medium,large --episodes 1 --length 1
