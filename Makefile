@@ -87,28 +87,29 @@ policy-airme-stale-profit: $(INSTALLED)
 	$(BIN)/marl-sched export runs/airme-stale-profit airme-stale-profit --out agents/policies/shipped --episodes 1
 
 # MuRSE: first what a roll-out of the latest-start rule would choose, then what choices cost on average, so that one is
-# surely made, the surer the longer it goes on. All stages together take an hour of one core.
+# surely made. A teacher that sees everything does not know which tasks will be in nobody's sight, so a policy for local
+# views also learns from the best of its own episodes. Each target takes less than half an hour of one core.
 MURSE := env=murse policy=hetgat_residual curriculum=rounds 'env.scales=[small,medium]' validation.every=10
-PLANNED := $(MURSE) algorithm=rollout_imitation curriculum.start=1 curriculum.stop=1 +env.options.durations=deterministic validation.length=1
-COSTS := algorithm.criterion=expected_cost algorithm.temperature=0.01 algorithm.final_temperature=0.002 \
-	algorithm.learning_rate=1e-3 validation.instances=150 validation.baseline=lst
+TAUGHT := $(MURSE) algorithm=rollout_imitation
+PLANNED := $(TAUGHT) curriculum.start=1 curriculum.stop=1 +env.options.durations=deterministic validation.length=1
+COSTS := algorithm.criterion=expected_cost algorithm.final_temperature=0.002 validation.baseline=lst
+ONLINE := view=local +env.options.mode=online +env.options.durations=stochastic validation.instances=40 \
+	validation.length=3 validation.baseline=lst
 
 policy-murse-full-makespan: $(INSTALLED)
 	$(call trained,murse-full-imitation,$(PLANNED) updates=80 validation.instances=100)
-	$(call trained,murse-full-costs,$(PLANNED) $(COSTS) updates=120 \
-		start_from=runs/murse-full-imitation/policy.safetensors)
-	$(call trained,murse-full-makespan,$(PLANNED) $(COSTS) validation.every=15 algorithm.temperature=0.003 \
-		algorithm.final_temperature=0.001 algorithm.epochs=1 updates=180 seed=1 \
-		start_from=runs/murse-full-costs/policy.safetensors)
+	$(call trained,murse-full-makespan,$(PLANNED) $(COSTS) algorithm.temperature=0.01 algorithm.learning_rate=1e-3 \
+		validation.instances=150 updates=120 start_from=runs/murse-full-imitation/policy.safetensors)
 	$(BIN)/marl-sched export runs/murse-full-makespan murse-full-makespan --out agents/policies/shipped \
 		--scales small,medium,large --episodes 1 --length 1
 
 policy-murse-local-makespan: policy-murse-full-makespan
-	$(call trained,murse-local-makespan,$(MURSE) view=local +env.options.mode=online \
-		+env.options.durations=stochastic algorithm=rollout_imitation algorithm.teacher=lst-robust-rollout \
-		algorithm.criterion=expected_cost algorithm.temperature=0.005 algorithm.final_temperature=0.002 \
-		algorithm.learning_rate=5e-4 updates=60 validation.instances=40 validation.length=3 validation.baseline=lst \
-		start_from=runs/murse-full-costs/policy.safetensors)
+	$(call trained,murse-local-costs,$(TAUGHT) $(ONLINE) $(COSTS) algorithm.teacher=lst-robust-rollout \
+		algorithm.temperature=0.005 algorithm.learning_rate=5e-4 updates=60 \
+		start_from=runs/murse-full-makespan/policy.safetensors)
+	$(call trained,murse-local-makespan,$(MURSE) $(ONLINE) curriculum.start=1 curriculum.stop=1 \
+		algorithm=self_labelling algorithm.episodes=16 algorithm.learning_rate=5e-4 updates=80 seed=1 \
+		start_from=runs/murse-local-costs/policy.safetensors)
 	$(BIN)/marl-sched export runs/murse-local-makespan murse-local-makespan --out agents/policies/shipped \
 		--scales small,medium,large --instances 30 --episodes 1
 
