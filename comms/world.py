@@ -100,6 +100,7 @@ class World:
         self._told: tuple[str, int] = ("", -1)
         self._chosen: dict[int, ev.Choice] = {}  # by agents whose turn has not come yet
         self._tick = self._passed = 0
+        self._applied = False  # choices, and the plant has not been asked yet where it stands now
         self._refused = refused or Refusals()
         self._observation = Observation(self.domain.agent_prefix, self.telemetry.time_unit, options.problem.horizon)
 
@@ -134,15 +135,26 @@ class World:
         self._tell_progress()
 
     def _turn_once(self) -> None:
-        """Wait for the next event, or until the protocol wants to be woken, and carry out what it says."""
-        event = self.transport.receive(max(self.protocol.wake_at - self._clock(), 0.0))
+        """Wait for the next event, or until the protocol wants to be woken, and carry out what it says.
+
+        When choices were applied the plant goes on after one event that waits already, so that a world whose time is
+        always overdue hears what is said all the same.
+        """
+        applied, self._applied = self._applied, False
+        event = self.transport.receive(0.0 if applied else max(self.protocol.wake_at - self._clock(), 0.0))
+        if event is not None or not applied:
+            self._take(event)
+        if applied:
+            self._advance()
+        self._tell_progress()
+
+    def _take(self, event: ev.Event | None) -> None:
         if isinstance(event, ev.Received):
             self._count_heard(event)
         effects = self.protocol.handle(ev.Wake() if event is None else event, self._clock())
         self._perform(effects)
         if isinstance(event, ev.Queried) and not any(isinstance(effect, ev.Reply | ev.Order) for effect in effects):
             self.transport.reply(event.query, None)
-        self._tell_progress()
 
     def _count_heard(self, event: ev.Received) -> None:
         try:
@@ -205,7 +217,7 @@ class World:
         for commit in commits:
             self.metrics.counts["conflicts"] += commit.outcome == ev.Outcome.CONFLICT
             self.metrics.counts["illegal"] += commit.outcome == ev.Outcome.ILLEGAL
-        self._advance()
+        self._applied = True
 
     def _advance(self) -> None:
         state = self.plant.state()

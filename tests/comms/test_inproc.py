@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 
 import msgspec
@@ -267,3 +268,17 @@ def test_endpoint_that_other_machines_reach_is_refused_unless_asked_for(endpoint
     with pytest.raises(InvalidOptionError, match="is reached by other machines"):
         options(listen=endpoint)
     assert options(listen=endpoint, insecure=True).listen == endpoint
+
+
+def test_clock_that_nobody_can_follow_ends_the_run_in_time_and_its_world_still_hears(make_run, tmp_path):
+    """Every turn is overdue when it comes: thousands of them in a row, none inside the one before."""
+    given = options(horizon=1500, clock="paced", pace=1e-6, report=str(tmp_path / "report.json"))
+    run = make_run(given, ["condition"] * 7)
+    report = run.play()
+    assert report.ending.kind == "complete"
+    assert report.time == 1500
+    assert report.counts["tick_overruns"] > 1000
+    again = make_run(options(horizon=10**6, clock="paced", pace=1e-6), ["condition"] * 7)
+    timer = threading.Timer(3.0, lambda: again.world.transport.inject(ev.Interrupted(15)))
+    timer.start()
+    assert again.play().ending.kind == "interrupted"
