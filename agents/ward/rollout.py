@@ -101,7 +101,7 @@ class MarginalCostRollout(CostScheduler):
     name = "marginal-cost-rollout"
     privileged_info = PrivilegedInfo.PLACES | PrivilegedInfo.ARRIVALS
 
-    def __init__(self, quarters: int = 16, samples: int = 4) -> None:
+    def __init__(self, quarters: int = 12, samples: int = 16) -> None:
         self._quarters = require_integer(f"{self.name}: quarters", quarters, 1, 1_000_000)
         self._samples = require_integer(f"{self.name}: samples", samples, 1, 65_536)
 
