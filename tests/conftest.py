@@ -18,7 +18,7 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     if hasattr(config, "workerinput") or not getattr(config.option, "numprocesses", None):
         return
     warm = Path(__file__).with_name("warm.py")
-    running = [subprocess.Popen([sys.executable, "-P", str(warm), domain]) for domain in ("airme", "murse")]
+    running = [subprocess.Popen([sys.executable, "-P", str(warm), domain]) for domain in ("airme", "murse", "ward")]
     codes = [process.wait() for process in running]
     if any(codes):
         raise pytest.UsageError("compiling the kernels failed; see above")

@@ -13,12 +13,14 @@ from pathlib import Path
 from markdown_it import MarkdownIt
 
 ROOT = Path(__file__).resolve().parents[2]
+TIMEOUT = 900  # seconds: a page takes half a minute on an idle core
 LANGUAGES = ("python", "sh")  # blocks of other languages are shown, not run
 # A reader plays a hundred instances, a test a few: the same command, less of it.
 LESS = {
     r"--instances (\d+)": "--instances 2",
     r"--episodes (\d+)": "--episodes 1",
     r"--hours (\d+)": "--hours 24",
+    r"(marl-sched (?:compare|evaluate) --env airme)": r"\1 --hours 48",
     r"pip install .*": ":",  # installed already
 }
 
@@ -64,7 +66,7 @@ def run_page(page: Path, folder: Path) -> None:
         env=environment,
         capture_output=True,
         text=True,
-        timeout=280,
+        timeout=TIMEOUT,
         check=False,
     )
     assert done.returncode == 0, f"{page.name}\n{done.stdout[-2000:]}\n{done.stderr[-4000:]}"
