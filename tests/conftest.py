@@ -1,5 +1,6 @@
 """Settings of every test, and kernels that are compiled once before several processes run tests."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,9 @@ from hypothesis import settings
 # A kernel's first call compiles it and would miss any deadline; the same commit tries the same examples.
 settings.register_profile("marl_sched", deadline=None, derandomize=True)
 settings.load_profile("marl_sched")
+
+# Ray's workers are nice to others by default, and starve beside the other processes that run tests.
+os.environ.setdefault("RAY_worker_niceness", "0")
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
