@@ -32,8 +32,8 @@ def listed(monkeypatch):
     """Replace the list that ships: `listed(rows...)` adds rows to the tiny one."""
 
     def listed(*rows):
-        plan = plans.as_plan({**TINY, "rows": [*TINY["rows"], *rows]}, "tiny.yaml")
-        monkeypatch.setattr(plans, "load_plan", lambda env: plan)
+        given = {**TINY, "rows": [*TINY["rows"], *rows]}
+        monkeypatch.setattr(plans, "shipped_list", lambda env: (given, "tiny.yaml"))
 
     return listed
 
@@ -78,7 +78,7 @@ def test_drawing_plays_nothing_and_names_the_command_where_a_cell_is_missing(run
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--env", "murse"), "there are no published tables of the environment 'murse'"),
+        (("--env", "ward"), "there are no published tables of the environment 'ward'"),
         (("--env", "airma"), "unknown environment 'airma'"),
         (("--out", __file__), "is not a folder"),
         (("--workers", 0), "--workers"),
