@@ -11,6 +11,7 @@ from marl_sched.comms.chaos.scene import Scene
 from marl_sched.comms.security.identity import WORLD
 
 AGAIN, RECONNECTED = 2.0, 3.0  # seconds after a fault, and after a cut link: lease, retry and one heartbeat
+MEANWHILE = 10.0  # seconds in which all are heard while messages go on faring badly, the observer's too
 Behind = Callable[[int], Iterable[int]]
 
 
@@ -65,7 +66,8 @@ def _messages(name: str, seconds: float = 8.0, *, short: bool = False, **faults:
         scene.go_on(seconds)
         scene.heard_again()
 
-    return Case(name=name, fault=watched, needs=tuple(faults), world={"faults": {**faults, "seed": 1}}, in_short=short)
+    world = {"faults": {**faults, "seed": 1}}
+    return Case(name=name, fault=watched, needs=tuple(faults), world=world, heard_s=MEANWHILE, in_short=short)
 
 
 def _watched(scene: Scene) -> None:

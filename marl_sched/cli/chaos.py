@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import tempfile
 import uuid
 from dataclasses import dataclass
@@ -73,10 +74,13 @@ def chaos(
     """Let things go wrong in a deployment, hold its log against the invariants, and say what it cost."""
     from marl_sched.comms.chaos.campaign import Row, as_json, campaign, exit_code, fuzz_row, stops_row, table
     from marl_sched.comms.chaos.cases import CASES
+    from marl_sched.comms.process import SIGNALS, leave
     from marl_sched.domain import get_domain
     from marl_sched.files import write_json
 
     options.check_output(json)
+    for number in SIGNALS:
+        signal.signal(number, leave)  # which ends what was started, and removes the folders
     domain = get_domain(team.env)
     policy = policy or (domain.demo.local_rules[0] if domain.demo else "")
     if not policy:
