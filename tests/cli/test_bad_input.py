@@ -1,6 +1,7 @@
 """Whatever is wrong: one line that says what and where, exit code 2, no traceback, nothing half-written."""
 
 import json
+import re
 import socket
 import subprocess
 import sys
@@ -106,7 +107,7 @@ def test_an_unknown_environment_is_refused_before_anything_is_written(run, tmp_p
         (lambda text: text.replace('"n_crews": 7', '"n_crews": -7'), ["n_crews", "-7"]),
         (lambda text: text.replace('"landings"', '"landing"', 1), ["planes[0]", "landings"]),
         (lambda text: text.replace('"env": "airme"', '"env": "boats"'), ["env", "'airme'"]),
-        (lambda text: text.replace('"schema": 1', '"schema": 99'), ["schema", "99"]),
+        (lambda text: re.sub(r'"schema": \d+', '"schema": 99', text), ["schema", "99"]),
     ],
     ids=["truncated", "empty", "negative crews", "missing field", "another environment", "another schema"],
 )
@@ -194,7 +195,6 @@ def test_a_training_log_that_is_none_is_refused_before_the_work(run, tmp_path, c
         (("--policy", "condition", "--scale", "huge"), ["unknown scale of airme 'huge'"]),
         (("--policy", "condition", "--instance", "nowhere.json"), ["nowhere.json"]),
         (("--policy", "condition", "--deadline", "0"), ["deadline"]),
-        (("--policy", "edf", "--env", "murse", "--rounds", "1"), ["murse has no telemetry"]),
         (("--policy", "condition", "--patience", "0"), ["patience"]),
         (("--policy", "condition", "--agent-policy", "crew_3"), ["AGENT=POLICY", "'crew_3'"]),
         (("--policy", "condition", "--agent-policy", "crew_99=random"), ["'crew_99'", "crew_0"]),

@@ -22,10 +22,25 @@ def fixed(length: int) -> EpisodeLength:
 
 
 def task(
-    *, rows: int = 4, length: int = 8, turns: int | None = 30, view: Mapping[str, Any] = LOCAL, **options: Any
+    *,
+    rows: int = 4,
+    length: int = 8,
+    turns: int | None = 30,
+    view: Mapping[str, Any] = LOCAL,
+    options: Mapping[str, Any] | None = None,
+    **of_task: Any,
 ) -> TrainingTask:
-    problem = Problem("airme", scale="small", objective="profit", view=view, seed=3, split="train", horizon=2 * length)
-    return TrainingTask(problem=problem, scales=["small"], rows=rows, length=fixed(length), turns=turns, **options)
+    problem = Problem(
+        "airme",
+        scale="small",
+        objective="profit",
+        view=view,
+        seed=3,
+        split="train",
+        horizon=2 * length,
+        options=options,
+    )
+    return TrainingTask(problem=problem, scales=["small"], rows=rows, length=fixed(length), turns=turns, **of_task)
 
 
 def segment(policy: HetGATNetwork, **options: Any) -> Rollout:

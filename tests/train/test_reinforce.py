@@ -14,7 +14,6 @@ from marl_sched.agents.networks.deeprm import DeepRMNetwork
 from marl_sched.agents.networks.network import slots_of
 from marl_sched.agents.policies.cards import read_card
 from marl_sched.cli.app import run as run_command
-from marl_sched.domain import get_domain
 from marl_sched.files import read_json, write_json
 from marl_sched.problem import Problem
 from marl_sched.train.algorithms.step_baseline import StepBaseline
@@ -140,8 +139,7 @@ def test_a_policy_is_played_as_it_was_validated(tmp_path: Path):
     assert load_policy(path).mode == "sample"
     assert load_policy(path, mode="greedy").mode == "greedy"
     seed = load_config(overrides).validation.seed
-    instances = get_domain("airme").instances("small", 2, seed, "validation")
-    problem = Problem("airme", instances=instances, pad="small", episodes=1, seed=seed, horizon=20)
+    problem = Problem("airme", scale="small", count=2, episodes=1, seed=seed, split="validation", horizon=20)
     scores = evaluate_scheduler(problem, load_policy(path)).measures["profit"]
     assert read_card(directory / "policy.json").scores["validation"]["M1"] == pytest.approx(scores.mean())
     greedy = evaluate_scheduler(problem, load_policy(path, mode="greedy")).measures["profit"]

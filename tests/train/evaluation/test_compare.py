@@ -71,7 +71,7 @@ def test_the_episode_that_is_drawn_is_the_first_one_that_was_scored():
     scores = evaluate_scheduler(problem, RULES["random"]())
     drawn = play_episode(problem, RULES["random"]())
     assert drawn.objectives()["profit"][0] == scores.measures["profit"][0, 0]
-    assert AIRME.render["rgb_array"](drawn, 0).shape == (4 * instances[0].n_planes, 2 * 48, 3)
+    assert AIRME.render["rgb_array"](drawn, 0).shape == (540, 960, 3)
 
 
 def test_a_learning_curve_has_the_validated_rows_in_minutes(tmp_path):
