@@ -14,7 +14,7 @@ from markdown_it import MarkdownIt
 
 ROOT = Path(__file__).resolve().parents[2]
 TIMEOUT = 900  # seconds: a page takes half a minute on an idle core
-LANGUAGES = ("python", "sh")  # blocks of other languages are shown, not run
+LANGUAGES = ("python", "sh")  # blocks of other languages, and those with a title, are shown, not run
 # A reader plays a hundred instances, a test a few: the same command, less of it.
 LESS = {
     r"--instances (\d+)": "--instances 2",
@@ -37,8 +37,8 @@ class Block:
 def blocks(page: Path) -> Iterator[Block]:
     """The blocks of a page that are run, in order."""
     for token in MarkdownIt().parse(page.read_text(encoding="utf-8")):
-        if token.type == "fence" and token.info.split(" ")[0] in LANGUAGES and token.map is not None:
-            yield Block(token.info.split(" ")[0], token.content, token.map[0] + 1)
+        if token.type == "fence" and token.info.strip() in LANGUAGES and token.map is not None:
+            yield Block(token.info.strip(), token.content, token.map[0] + 1)
 
 
 def run_page(page: Path, folder: Path) -> None:
