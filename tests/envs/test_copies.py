@@ -284,10 +284,11 @@ print("no index went astray")
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1000)  # two minutes on an idle core: every kernel is compiled once more
 def test_no_kernel_reaches_outside_its_arrays():
     """All kernels compiled with checks of every index, on copies and padded rows too."""
     environment = {**os.environ, "NUMBA_BOUNDSCHECK": "1", "NUMBA_OPT": "0"}
     done = subprocess.run(
-        [sys.executable, "-c", CHECKED], env=environment, capture_output=True, text=True, check=False, timeout=280
+        [sys.executable, "-c", CHECKED], env=environment, capture_output=True, text=True, check=False, timeout=950
     )
     assert done.stdout == "no index went astray\n", done.stderr
