@@ -47,7 +47,7 @@ def score_bars(*tables: Results) -> Figure:
     drawn = [interval or (score.iqm,) * 2 for interval, score in zip(intervals, scores, strict=True)]
     low, high = np.array(drawn).T
     means = np.array([score.mean for score in scores])
-    figure = Figure(figsize=(8.5, 1.7 + 0.4 * len(rows)), layout="constrained")
+    figure = Figure(figsize=(8.5, 1.9 + 0.4 * len(rows)), layout="constrained")
     axes = figure.add_subplot()
     y = np.arange(len(rows))
     axes.barh(y, iqm, color=[_BARS[table % len(_BARS)] for _, _, table in rows], height=0.62)
@@ -77,7 +77,7 @@ def score_bars(*tables: Results) -> Figure:
         )
     )
     handles.append(Line2D([], [], color=_INK, marker="D", ms=4, ls="none", label="mean"))
-    figure.legend(handles=handles, loc="outside lower right", ncols=len(handles), frameon=False, fontsize=8)
+    figure.legend(handles=handles, loc="outside lower right", ncols=2, frameon=False, fontsize=8)
     return figure
 
 
