@@ -149,11 +149,6 @@ class Plan(_Part, frozen=True, kw_only=True):
         return get_domain(self.env)
 
 
-def load_plan(env: str) -> Plan:
-    """The list that ships for a domain; InvalidOptionError if there is none, InvalidFileError for a damaged one."""
-    return as_plan(*shipped_list(env))
-
-
 def shipped_list(env: str) -> tuple[dict[str, Any], str]:
     """The list that ships for a domain as plain data, and its name; InvalidOptionError if there is none."""
     get_domain(env)

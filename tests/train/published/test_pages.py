@@ -11,7 +11,7 @@ from marl_sched.errors import InvalidFileError, MarlSchedError
 from marl_sched.train.config import load_config
 from marl_sched.train.published.entries import Entries
 from marl_sched.train.published.page import page, write_pages
-from marl_sched.train.published.plan import as_plan, load_plan
+from marl_sched.train.published.plan import as_plan, shipped_list
 from marl_sched.train.published.results import Results
 from marl_sched.train.published.store import Cells
 
@@ -193,7 +193,7 @@ def test_a_list_that_is_wrong_is_refused_in_one_line(tiny, change, message):
 
 
 def test_the_list_that_ships_has_every_method_of_the_dissertation_in_every_table():
-    plan = load_plan("airme")
+    plan = as_plan(*shipped_list("airme"))
     published = {row.label: row.published for row in plan.rows if row.group == "published"}
     assert list(published) == METHODS
     for entries in published.values():
@@ -206,14 +206,14 @@ def test_the_list_that_ships_has_every_method_of_the_dissertation_in_every_table
 
 
 def test_the_list_that_ships_names_no_place_outside_the_repository():
-    plan = load_plan("airme")
+    plan = as_plan(*shipped_list("airme"))
     policies = [player.policy for player in [*plan.rows, *plan.decentralisation.lines] if player.policy]
     assert policies
     assert not [policy for policy in policies if policy.startswith(("/", "~")) or ".." in policy]
 
 
 def test_every_command_of_the_list_that_ships_is_one_that_trains():
-    plan = load_plan("airme")
+    plan = as_plan(*shipped_list("airme"))
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     asked = [
         (row.command.replace("{objective}", objective).replace("{scale}", scale), objective)
@@ -238,7 +238,7 @@ def test_every_command_of_the_list_that_ships_is_one_that_trains():
 
 @pytest.mark.parametrize("path", sorted(RESULTS.glob("airme.md")), ids=lambda path: path.stem)
 def test_the_committed_page_is_what_the_committed_cells_give(path, tmp_path):
-    plan = load_plan(path.stem)
+    plan = as_plan(*shipped_list(path.stem))
     entries = Entries(plan, plan.full, ROOT)
     command = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))["command"]
     write_pages(entries, Cells(RESULTS / path.stem / "cells.jsonl"), command, tmp_path)
