@@ -20,6 +20,7 @@ from marl_sched.errors import InvalidFileError, InvalidOptionError, MarlSchedErr
 from marl_sched.plugins import SCHEDULERS, import_object, is_object_name, load_offered, offered
 
 if TYPE_CHECKING:
+    from marl_sched.agents.networks.planner import TrainedPlanner
     from marl_sched.agents.policies.network_policy import NetworkPolicy, RecurrentPolicy
     from marl_sched.graph import GraphSpec
 
@@ -88,13 +89,13 @@ def create_scheduler(name_or_path: str | Path, domain: Domain | str, **options: 
     return policy if samples is None else _best_of(policy, samples, domain_name)
 
 
-def _best_of(policy: NetworkPolicy | RecurrentPolicy, samples: int, domain: str) -> Scheduler:
+def _best_of(policy: Scheduler, samples: int, domain: str) -> Scheduler:
     """What follows the best of so many samples of a policy; InvalidOptionError where the domain has no such thing."""
     best_of = get_domain(domain).best_of
     if best_of is None:
         raise InvalidOptionError(f"scheduler {policy.name}: samples: schedules of {domain} are not sampled")
     if not isinstance(policy, ObservationScheduler):
-        raise InvalidOptionError(f"scheduler {policy.name}: samples: expected a policy without a memory")
+        raise InvalidOptionError(f"scheduler {policy.name}: samples: expected a policy without memory or plan")
     made: Scheduler = best_of(policy, samples)
     return made
 
@@ -108,12 +109,13 @@ def _create_named(where: str, options: Mapping[str, Any]) -> Scheduler:
 
 
 def load_policy(
-    name_or_path: str | Path, *, mode: Mode | None = None, graph: GraphSpec | None = None
-) -> NetworkPolicy | RecurrentPolicy:
+    name_or_path: str | Path, *, mode: Mode | None = None, graph: GraphSpec | None = None, **options: Any
+) -> NetworkPolicy | RecurrentPolicy | TrainedPlanner:
     """A trained policy by its shipped name, or by the path of its weights or its card.
 
-    `mode` is `greedy` or `sample`, None: as its card says. One whose network has a memory is a RecurrentPolicy. With a
-    `graph` a policy that was trained on another metagraph is refused. Raises UnknownNameError for a name that does not
+    `mode` is `greedy` or `sample`, None: as its card says. One whose network has a memory is a RecurrentPolicy, one
+    that plans whole rounds a TrainedPlanner, to which `options` go. With a `graph` a policy that was trained on another
+    metagraph is refused. Raises UnknownNameError for a name that does not
     ship, InvalidFileError for damaged files, MarlSchedError without PyTorch.
     """
     path = policy_path(name_or_path)
@@ -125,7 +127,7 @@ def load_policy(
         raise MarlSchedError(
             f"policy {name_or_path}: expected {error.name} to be installed: pip install 'marl-sched[policies]'"
         ) from error
-    return TrainedPolicy.load(path, mode=mode, graph=graph)
+    return TrainedPolicy.load(path, mode=mode, graph=graph, **options)
 
 
 def card_of(name_or_path: str | Path, domain: Domain | str) -> PolicyCard | None:

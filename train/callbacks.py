@@ -23,7 +23,7 @@ from torchrl.record.loggers import get_logger
 
 from marl_sched.errors import MarlSchedError
 from marl_sched.train.checkpoint import Counters
-from marl_sched.train.collect import Rollout
+from marl_sched.train.collect import Experience
 
 if TYPE_CHECKING:
     from marl_sched.train.parts import Parts
@@ -53,8 +53,8 @@ class Callback:
     def on_start(self, run: Run) -> None:
         """Before the first update of this process; `run.counters.update` is not 0 where a run goes on."""
 
-    def on_rollout(self, run: Run, rollout: Rollout) -> None:
-        """Turns were collected, nothing was learned from them yet."""
+    def on_rollout(self, run: Run, rollout: Experience) -> None:
+        """Turns, or other experience, were collected, nothing was learned from them yet."""
 
     def on_validation(self, run: Run, score: float) -> None:
         """The policy played the validation instances."""

@@ -118,18 +118,40 @@ class Rollout:
         return int(self.valid.sum())
 
 
+class Experience(Protocol):
+    """What the training loop has to know of what was collected; the rest is between a collector and its learner."""
+
+    @property
+    def length(self) -> int:
+        """Of the episodes, in the domain's unit."""
+
+    @property
+    def seconds(self) -> float:
+        """Wall time that collecting took."""
+
+    @property
+    def reward_rate(self) -> float:
+        """Reward per unit of simulated time."""
+
+    @property
+    def time(self) -> int:
+        """Simulated time that passed."""
+
+    @property
+    def decisions(self) -> int:
+        """How many decisions can be learned from."""
+
+
 class Collector(Protocol):
     """What the training loop asks for.
 
     Attributes:
         name: as in the configuration.
-        env: an environment of the same kind, for its metagraph and sizes.
     """
 
     name: str
-    env: TrainingEnv
 
-    def collect(self, policy: PolicyNetwork, length: int) -> Rollout:
+    def collect(self, policy: PolicyNetwork, length: int) -> Experience:
         """Play with the policy's present parameters; episodes that begin now have that length."""
 
     def state(self) -> dict[str, np.ndarray]:

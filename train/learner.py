@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -29,8 +29,8 @@ class Learner(Protocol):
     modules: dict[str, nn.Module]
     optimizer: torch.optim.Adam
 
-    def learn(self, rollout: Rollout, progress: float, rng: np.random.Generator) -> dict[str, float]:
-        """Learn from a rollout; what is logged of it, by the names of marl_sched.train.logging.COLUMNS.
+    def learn(self, rollout: Any, progress: float, rng: np.random.Generator) -> dict[str, float]:
+        """Learn from what the algorithm's own collector gave, such as a Rollout; what is logged of it, by name.
 
         `progress` in [0, 1] is how far the run has come, `rng` picks and orders samples.
         """

@@ -19,7 +19,7 @@ from marl_sched.errors import InvalidOptionError
 from marl_sched.files import write_json
 from marl_sched.train.callbacks import Callback, LoggerCallback, Run
 from marl_sched.train.checkpoint import Counters
-from marl_sched.train.collect import Rollout
+from marl_sched.train.collect import Experience
 from marl_sched.train.config import RunRecord, TrainConfig, load_config, load_record
 from marl_sched.train.export import CONFIG
 from marl_sched.train.guard import exclusive, stopping
@@ -136,7 +136,7 @@ def _called(callbacks: Sequence[Callback], run: Run) -> Iterator[Sequence[Callba
         yield callbacks
 
 
-def _row(counters: Counters, rollout: Rollout) -> dict[str, float]:
+def _row(counters: Counters, rollout: Experience) -> dict[str, float]:
     """What is logged of an update beside the learner's report."""
     done = asdict(counters)
     del done["best"]  # told with the validation that found it

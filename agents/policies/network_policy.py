@@ -6,7 +6,7 @@ import copy
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple, TypedDict, Unpack, cast, get_args
+from typing import Any, NamedTuple, TypedDict, Unpack, cast, get_args
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from torch import Tensor
 from marl_sched.agents.base import ObservationScheduler, Scheduler, Worths, inverse_distribution
 from marl_sched.agents.networks.batches import logits_in_blocks, recurred_in_blocks
 from marl_sched.agents.networks.network import PolicyNetwork, RecurrentNetwork
+from marl_sched.agents.networks.planner import PlannerNetwork, TrainedPlanner
 from marl_sched.agents.policies.cards import Mode, PolicyCard, check_graph
 from marl_sched.agents.policies.checkpoint import load_network
 from marl_sched.agents.recurrent import RecurrentScheduler
@@ -99,17 +100,18 @@ class TrainedPolicy(Scheduler):
 
     @staticmethod
     def load(
-        path: str | Path, *, mode: Mode | None = None, graph: GraphSpec | None = None
-    ) -> NetworkPolicy | RecurrentPolicy:
+        path: str | Path, *, mode: Mode | None = None, graph: GraphSpec | None = None, **options: Any
+    ) -> NetworkPolicy | RecurrentPolicy | TrainedPlanner:
         """A policy from its files (marl_sched.agents.policies.checkpoint); its name is the file's.
 
-        `mode` None is its card's. Raises InvalidFileError for damaged files, or if the policy was trained on
-        another metagraph than `graph`.
+        `mode` None is its card's, `options` are a planner's. Raises InvalidFileError for damaged files, or if the
+        policy was trained on another metagraph than `graph`, TypeError for options that it does not have.
         """
         network, card = load_network(path)
         if graph is not None:
             check_graph(Path(path).with_suffix(".json"), card, graph)
-        return policy_of(network, name=Path(path).stem, mode=card.mode if mode is None else mode, card=card)
+        mode = card.mode if mode is None else mode
+        return policy_of(network, name=Path(path).stem, mode=mode, card=card, **options)
 
     def _check(self, simulator: TurnSimulator) -> None:
         """Raise InvalidFileError if the policy was trained on another metagraph than the simulator's."""
@@ -248,10 +250,28 @@ class RecurrentPolicy(TrainedPolicy, RecurrentScheduler):
         return logits.numpy(), after.numpy()
 
 
-def policy_of(network: PolicyNetwork, **options: Unpack[PolicyOptions]) -> NetworkPolicy | RecurrentPolicy:
-    """The policy that decides by a network, with a memory where the network has one; options as TrainedPolicy's."""
+def policy_of(
+    network: PolicyNetwork,
+    *,
+    name: str = "unsaved",
+    mode: Mode = "greedy",
+    card: PolicyCard | None = None,
+    domain: str | None = None,
+    **options: Any,
+) -> NetworkPolicy | RecurrentPolicy | TrainedPlanner:
+    """The policy that decides by a network, with a memory where the network has one; options as TrainedPolicy's.
+
+    A planner's network makes its own scheduler, from its further `options`. It plans greedily: InvalidOptionError for
+    another mode. Raises TypeError for options of a network that plans nothing.
+    """
+    if isinstance(network, PlannerNetwork):
+        if mode != "greedy":
+            raise InvalidOptionError(f"mode of policy {name}: expected greedy, as it plans whole rounds, got {mode!r}")
+        return network.planner(name, card, **options)
+    if options:
+        raise TypeError(f"policy {name}: unknown options {', '.join(sorted(options))}")
     kind = RecurrentPolicy if isinstance(network, RecurrentNetwork) else NetworkPolicy
-    return kind(network, **options)
+    return kind(network, name=name, mode=mode, card=card, domain=domain)
 
 
 def _tensor(array: np.ndarray) -> Tensor:

@@ -23,6 +23,7 @@ from marl_sched.domain import get_domain
 from marl_sched.envs.api.torchrl_env import SchedulingTorchRL
 from marl_sched.errors import InvalidOptionError, UnknownNameError
 from marl_sched.problem import Problem
+from marl_sched.simulation import TurnSimulator
 from marl_sched.train.collect import Collector, SegmentCollector, segment_collector
 from marl_sched.train.curriculum import EpisodeLength
 from marl_sched.train.device import pick_device
@@ -74,14 +75,8 @@ class Setup:
     def _task(self, **options: Any) -> TrainingTask:
         config = self.config
         domain = get_domain(config.env.name)
-        problem = Problem(
-            domain,
-            scale=domain.largest_scale(config.env.scales),
-            objective=config.env.objective,
-            view=config.view,
-            options=config.env.options,
-            seed=config.seed,
-            split="train",
+        problem = self.problem(
+            domain.largest_scale(config.env.scales),
             horizon=2 * self.length.longest,  # cuts come before the end, so that a state at a cut still has a value
         )
         return TrainingTask(
@@ -92,11 +87,27 @@ class Setup:
             **options,
         )
 
+    def problem(self, scale: str, **words: Any) -> Problem:
+        """What a run is about, with instances of a scale that training draws; `words` are those of Problem."""
+        config = self.config
+        given = {"seed": config.seed, "split": "train", **words}
+        return Problem(
+            get_domain(config.env.name),
+            scale=scale,
+            objective=config.env.objective,
+            view=config.view,
+            options=config.env.options,
+            **given,
+        )
+
     def policy(self, env: SchedulingTorchRL) -> PolicyNetwork:
         """A freshly drawn network. Weights are drawn on the CPU, so that a seed's are the same on every device."""
-        simulator = env.simulator
+        return self.policy_for(env.simulator)
+
+    def policy_for(self, simulator: TurnSimulator) -> PolicyNetwork:
+        """A freshly drawn network for what a simulator shows, or for the network's own metagraph."""
         sizes = self.config.policy.for_slots(slots_of(simulator.graph, simulator.arrays))
-        return sizes.build(simulator.graph).to(pick_device(self.config.device))
+        return sizes.build(sizes.metagraph(simulator.graph)).to(pick_device(self.config.device))
 
     def critic(self, env: SchedulingTorchRL, sizes: HetGATConfig) -> HetGATCritic:
         """A freshly drawn value function, likewise."""
