@@ -1,0 +1,74 @@
+"""What the networks share that build schedules step by step: how they learn and what plays them."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from typing import Any, cast
+
+import numpy as np
+import torch
+
+from marl_sched.agents.murse.step_graph import SPEC
+from marl_sched.agents.murse.step_planner import StepPlanner, gathered_steps, played_schedule, steps_of
+from marl_sched.agents.networks.planner import StepwiseNetwork
+from marl_sched.agents.policies.cards import PolicyCard
+from marl_sched.errors import InvalidOptionError
+from marl_sched.graph import GraphSpec
+from marl_sched.simulation import TurnSimulator
+
+_READ = frozenset(SPEC.arrays(dict.fromkeys(("task", "agent", "place"), 1))) - {"time", "visible_share"}
+
+
+class StepGraphConfig:
+    """What the sizes say, beside NetworkConfig, of a network that reads the graph of a schedule under construction."""
+
+    __slots__ = ()
+
+    def metagraph(self, graph: GraphSpec) -> GraphSpec:
+        """See NetworkConfig: always that of marl_sched.agents.murse.step_graph."""
+        return SPEC
+
+
+class MurseStepNetwork(StepwiseNetwork):
+    """A network that gives the tasks which an agent can start their worths.
+
+    Args:
+        spec: the metagraph.
+
+    Raises InvalidOptionError for another metagraph than that of this version.
+    """
+
+    permutation_equivariant = True
+
+    def __init__(self, spec: GraphSpec) -> None:
+        super().__init__()
+        if spec != SPEC:
+            raise InvalidOptionError("graph: expected that of marl_sched.agents.murse.step_graph in this version")
+        self.spec = spec
+
+    def demonstration(self, simulator: TurnSimulator, row: int) -> np.ndarray:
+        """See StepwiseNetwork."""
+        return played_schedule(simulator, row)
+
+    def steps(self, instance: Any, schedule: np.ndarray, discount: float) -> Mapping[str, np.ndarray]:
+        """See StepwiseNetwork."""
+        found = steps_of(instance, schedule, discount)
+        return {name: array for name, array in found.items() if name in _READ or name in ("label", "return")}
+
+    def gathered(self, steps: list[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+        """See StepwiseNetwork."""
+        return gathered_steps([dict(each) for each in steps])
+
+    def planner(self, name: str, card: PolicyCard | None, **options: Any) -> StepPlanner:
+        """What plays a copy of the network on the CPU; options are StepPlanner's."""
+        network = copy.deepcopy(self).cpu().requires_grad_(False)
+        with torch.inference_mode():
+            weights = network.weights()
+
+        @torch.inference_mode()
+        def worths(arrays: dict[str, np.ndarray]) -> np.ndarray:
+            tensors = {name: torch.from_numpy(array) for name, array in arrays.items() if name in _READ}
+            return cast(np.ndarray, network(tensors, weights).numpy())
+
+        return StepPlanner(worths, name, card, **options)
