@@ -1,4 +1,4 @@
-"""The refusal of choices that a mask forbids, fast enough not to be what a benchmark measures."""
+"""Random choices among legal actions, and the refusal of others, fast enough not to be what a benchmark measures."""
 
 from __future__ import annotations
 
@@ -30,3 +30,24 @@ def idle_illegal(
         else:
             illegal[b] = True
     return outside
+
+
+@kernel
+def random_legal(mask: np.ndarray, uniform: np.ndarray) -> np.ndarray:
+    """A legal action for each row, int64 (B,), each with the same probability; 0 where nothing is legal.
+
+    mask bool (B, n_actions); uniform float64 (B,) in [0, 1).
+    """
+    actions = np.zeros(mask.shape[0], np.int64)
+    for b in range(mask.shape[0]):
+        legal = 0
+        for action in range(mask.shape[1]):
+            legal += mask[b, action]
+        left = int(uniform[b] * legal)
+        for action in range(mask.shape[1]):
+            if mask[b, action]:
+                if left == 0:
+                    actions[b] = action
+                    break
+                left -= 1
+    return actions

@@ -16,10 +16,10 @@ of the problem graph (see marl_sched.graph), and
     reward       (B, 1)  float64  team reward of that time
     done, terminated, truncated  (B, 1) bool
 
-`action_mask` is bool here, as TorchRL's masked distributions want it. The environment keeps the mask of its action
-spec up to date, so `rollout` without a policy and `rand_action` choose legal actions, with and without the transform
-ActionMask. SerialEnv, ParallelEnv and RandomPolicy (which `Collector(env, None)` takes) sample from a copy of the spec
-that knows no mask; what they choose wrongly does nothing and is marked `illegal`.
+`action_mask` is bool here, as TorchRL's masked distributions want it. The action spec looks at the mask of the turn
+(LegalActions), so `rollout` without a policy, `rand_action` and `Collector(env, None)` choose legal actions, with and
+without transforms. SerialEnv and ParallelEnv sample from a spec of their own that knows no mask; what they choose
+wrongly does nothing and is marked `illegal`.
 """
 
 from __future__ import annotations
@@ -30,10 +30,11 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.data import Binary, Bounded, Categorical, Composite, TensorSpec, Unbounded
+from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
 from marl_sched.domain import Domain
+from marl_sched.envs.api.legal_actions import CurrentMask, LegalActions
 from marl_sched.envs.api.options import OF_DOMAIN, DefaultScale, as_problem
 from marl_sched.envs.api.sampling import idle_illegal
 from marl_sched.envs.api.saving import SavedEnvironment, SavesState
@@ -114,7 +115,7 @@ class SchedulingTorchRL(SavesState, EnvBase):
         self.domain, self._source = self.problem.domain, source
         self._set_seed(self.problem.seed)
         self.simulator = self.problem.simulator_of(self._instances(range(rows), 0))
-        self._mask = np.ones((rows, self.simulator.max_actions), bool)  # of the choices to be made now
+        self._legal = CurrentMask(np.ones((rows, self.simulator.max_actions), bool))
         self._allowed, self._illegal = np.zeros(rows, np.int64), np.zeros(rows, bool)
         self._scratch = self.simulator.new_observation()
         dtypes = {name: _torch_dtype(s.dtype) for name, s in self.simulator.arrays.items()} | {ACTION_MASK: torch.bool}
@@ -138,20 +139,15 @@ class SchedulingTorchRL(SavesState, EnvBase):
             illegal=Binary(shape=batch, dtype=torch.bool),
             shape=batch,
         ).to(self.device)
-        self.action_spec = Categorical(self.simulator.max_actions, batch, dtype=torch.int64, device=self.device)
-        self._link_mask()
+        self.action_spec = LegalActions(self.simulator.max_actions, batch, self.device, current=self._legal)
         self.reward_spec = Unbounded((*batch, 1), dtype=torch.float64, device=self.device)
         done = {name: Binary(shape=(*batch, 1), dtype=torch.bool) for name in ("done", "terminated", "truncated")}
         self.done_spec = Composite(**done, shape=batch).to(self.device)
 
-    def _link_mask(self) -> None:
-        """Let the action spec read the mask of the choices to be made now: it shares the mask's memory."""
-        self.action_spec.update_mask(torch.from_numpy(self._mask))
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Finish a copy, in which spec and mask no longer share their memory."""
-        super().__setstate__(state)
-        self._link_mask()
+    @property
+    def _mask(self) -> np.ndarray:
+        """The actions that are legal now, bool (B, n_actions)."""
+        return self._legal.legal
 
     def _set_seed(self, seed: int | None) -> None:
         self.problem = self.problem.but(seed=seed)

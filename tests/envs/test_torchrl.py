@@ -1,11 +1,16 @@
 from __future__ import annotations
 
+import pickle  # noqa: TID251 (what is tested is that users may)
+from copy import deepcopy
+
 import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch")
 
 from tensordict import TensorDict  # noqa: E402
+from torchrl.collectors import Collector  # noqa: E402
+from torchrl.data.utils import _find_action_space  # noqa: E402
 from torchrl.envs import TransformedEnv, step_mdp  # noqa: E402
 from torchrl.envs.transforms import ActionMask, StepCounter  # noqa: E402
 from torchrl.envs.utils import check_env_specs  # noqa: E402
@@ -55,6 +60,37 @@ def test_random_choices_are_uniform_over_legal_actions():
     expected = (td["action_mask"] / td["action_mask"].sum(-1, keepdim=True)).sum(0)
     assert (chosen[expected == 0] == 0).all()
     assert ((chosen - expected).abs() <= 5 * expected.sqrt()).all()
+
+
+@pytest.mark.parametrize(
+    "handled",
+    [lambda env: env, deepcopy, lambda env: pickle.loads(pickle.dumps(env))],  # noqa: S301
+    ids=["itself", "copied", "pickled"],
+)
+def test_random_choices_are_legal_under_transforms(domain, handled):
+    """A transformed environment draws from a clone of the action spec: the clone looks at the present mask, too."""
+    env = TransformedEnv(make(domain), StepCounter())
+    env.rollout(5)
+    rollout = handled(env).rollout(80, break_when_any_done=False)
+    assert rollout["action_mask"].gather(-1, rollout["action"].unsqueeze(-1)).all()
+    assert not rollout["next", "illegal"].any()
+
+
+def test_a_collector_without_a_policy_chooses_legal_actions(domain):
+    (data,) = Collector(make(domain), None, frames_per_batch=90, total_frames=90)
+    assert not data["next", "illegal"].any()
+
+
+def test_the_action_spec_is_a_categorical_for_torchrl(domain):
+    spec = make(domain).action_spec
+    assert _find_action_space(spec) == "categorical"
+    own = torch.zeros(3, spec.n, dtype=torch.bool)
+    own[:, 2] = True
+    narrowed = spec.clone()
+    narrowed.update_mask(own)
+    assert (narrowed.clone().rand((4,)) == 2).all()
+    assert narrowed.rand((4,)).shape == (4, 3)
+    assert spec.clone().mask.data_ptr() == spec.mask.data_ptr()
 
 
 def test_the_mask_transform_serves_policies_that_sample_from_the_spec(domain):
