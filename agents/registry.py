@@ -90,12 +90,16 @@ def create_scheduler(name_or_path: str | Path, domain: Domain | str, **options: 
 
 
 def _best_of(policy: Scheduler, samples: int, domain: str) -> Scheduler:
-    """What follows the best of so many samples of a policy; InvalidOptionError where the domain has no such thing."""
+    """What follows the best of so many samples of a policy; InvalidOptionError where there is no such thing."""
+    from marl_sched.agents.networks.planner import TrainedPlanner
+
+    if isinstance(policy, TrainedPlanner):
+        return policy.best_of(samples)
     best_of = get_domain(domain).best_of
     if best_of is None:
         raise InvalidOptionError(f"scheduler {policy.name}: samples: schedules of {domain} are not sampled")
     if not isinstance(policy, ObservationScheduler):
-        raise InvalidOptionError(f"scheduler {policy.name}: samples: expected a policy without memory or plan")
+        raise InvalidOptionError(f"scheduler {policy.name}: samples: expected a policy without a memory")
     made: Scheduler = best_of(policy, samples)
     return made
 

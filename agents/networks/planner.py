@@ -15,6 +15,7 @@ import numpy as np
 
 from marl_sched.agents.base import Scheduler
 from marl_sched.agents.networks.network import PolicyNetwork
+from marl_sched.errors import InvalidOptionError
 from marl_sched.simulation import TurnSimulator
 
 if TYPE_CHECKING:
@@ -29,6 +30,10 @@ class TrainedPlanner(Scheduler):
     """
 
     card: PolicyCard | None = None
+
+    def best_of(self, samples: int) -> Scheduler:
+        """What follows the best of so many of its plans; InvalidOptionError for one that has a single plan."""
+        raise InvalidOptionError(f"scheduler {self.name}: samples: it makes one plan")
 
 
 class PlannerNetwork(PolicyNetwork):

@@ -47,6 +47,13 @@ ROLLOUT_IMITATION = [
     "validation.length=1",
 ]  # fmt: skip
 
+GREEDY_ROLLOUT = [
+    "env=murse", "policy=hybridnet", "algorithm=greedy_rollout", "curriculum=rounds", "env.scales=[small]",
+    "policy.width=2", "policy.heads=2", "policy.hidden=4", "policy.edge_width=2", "algorithm.instances=3",
+    "algorithm.samples=3", "algorithm.rounds=2", "algorithm.renew=2", "algorithm.imitation=0.1",
+    "algorithm.teacher=lst-search", "algorithm.teacher_share=0.5", "+env.options.durations=stochastic", "device=cpu",
+    "updates=4", "save_every=2", "validation.every=2", "validation.instances=2", "validation.length=1",
+]  # fmt: skip
 
 SELF_LABELLING = [
     "algorithm=self_labelling", *(word for word in TINY if ".ppo." not in word), "algorithm.instances=2",
@@ -91,6 +98,7 @@ def rows(directory: Path) -> list[dict[str, str]]:
         STATE_VALUE,
         RANDOM_VIEW,
         SELF_LABELLING,
+        GREEDY_ROLLOUT,
         pytest.param(IMITATION, marks=pytest.mark.slow),
         pytest.param(ROLLOUT_IMITATION, marks=pytest.mark.slow),
     ],
@@ -101,6 +109,7 @@ def rows(directory: Path) -> list[dict[str, str]]:
         "state_value",
         "random view",
         "self_labelling",
+        "greedy_rollout",
         "imitation",
         "rollout_imitation",
     ],
