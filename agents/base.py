@@ -11,14 +11,16 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 
 from marl_sched.errors import InvalidOptionError
 from marl_sched.graph import ACTION_MASK
 from marl_sched.privileged import PrivilegedInfo
-from marl_sched.simulation import TurnSimulator
+
+if TYPE_CHECKING:
+    from marl_sched.simulation import TurnSimulator
 
 
 class EpochPlayer(Protocol):

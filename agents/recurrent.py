@@ -10,12 +10,15 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from marl_sched.agents.base import ObservationScheduler, Scheduler, batched
 from marl_sched.errors import InvalidOptionError
-from marl_sched.simulation import TurnSimulator
+
+if TYPE_CHECKING:
+    from marl_sched.simulation import TurnSimulator
 
 Observation = Mapping[str, np.ndarray]
 

@@ -11,18 +11,23 @@ from collections.abc import Callable, Mapping
 from functools import cache, partial
 from importlib.metadata import EntryPoint
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 from marl_sched.agents.base import ObservationScheduler, Scheduler
 from marl_sched.agents.policies.cards import Mode, PolicyCard, read_card
+from marl_sched.agents.policies.trained import Runtime
 from marl_sched.domain import Domain, domain_names, get_domain
-from marl_sched.errors import InvalidFileError, InvalidOptionError, MarlSchedError, UnknownNameError
+from marl_sched.errors import InvalidFileError, InvalidOptionError, MarlSchedError, UnknownNameError, require
 from marl_sched.plugins import SCHEDULERS, import_object, is_object_name, load_offered, offered
 
 if TYPE_CHECKING:
     from marl_sched.agents.networks.planner import TrainedPlanner
-    from marl_sched.agents.policies.network_policy import NetworkPolicy, RecurrentPolicy
+    from marl_sched.agents.policies.network_policy import RecurrentPolicy
+    from marl_sched.agents.policies.onnx_policy import OnnxRecurrentPolicy
+    from marl_sched.agents.policies.trained import LogitsPolicy
     from marl_sched.graph import GraphSpec
+
+    AnyPolicy = LogitsPolicy | RecurrentPolicy | OnnxRecurrentPolicy | TrainedPlanner
 
 SHIPPED = Path(__file__).resolve().parent / "policies" / "shipped"
 _SUFFIXES = (".safetensors", ".json")
@@ -66,13 +71,15 @@ def scheduler_names(domain: str) -> list[str]:
     return [*rules(domain), *(name for name, card in shipped_policies().items() if card.domain == domain)]
 
 
-def create_scheduler(name_or_path: str | Path, domain: Domain | str, **options: Any) -> Scheduler:
+def create_scheduler(
+    name_or_path: str | Path, domain: Domain | str, *, runtime: Runtime = "torch", **options: Any
+) -> Scheduler:
     """The scheduler of that name, of that `package.module:factory`, or the policy in that file, for a domain.
 
-    `options` are those of the rule, or of `load_policy`; unknown ones raise TypeError. With `samples` the best of so
-    many schedules that a policy samples is followed, where the domain has such a thing (`Domain.best_of`). Raises
-    UnknownNameError for a name that nobody has, and InvalidFileError for a file that is damaged or holds another
-    domain's policy.
+    `runtime` is what runs a policy's network, see `load_policy`; rules have none. `options` are those of the rule, or
+    of `load_policy`; unknown ones raise TypeError. With `samples` the best of so many schedules that a policy samples
+    is followed, where the domain has such a thing (`Domain.best_of`). Raises UnknownNameError for a name that nobody
+    has, and InvalidFileError for a file that is damaged or holds another domain's policy.
     """
     domain_name = domain if isinstance(domain, str) else domain.name
     table = rules(domain_name)
@@ -82,7 +89,7 @@ def create_scheduler(name_or_path: str | Path, domain: Domain | str, **options: 
         return _create_named(str(name_or_path), options)
     _require_known(name_or_path, domain_name)
     samples = options.pop("samples", None)
-    policy = load_policy(name_or_path, **options)
+    policy = load_policy(name_or_path, runtime=runtime, **options)
     if policy.card is not None and policy.card.domain != domain_name:
         card_path = Path(name_or_path).with_suffix(".json")
         raise InvalidFileError(card_path, "domain", f"a policy for {domain_name}", policy.card.domain)
@@ -113,25 +120,38 @@ def _create_named(where: str, options: Mapping[str, Any]) -> Scheduler:
 
 
 def load_policy(
-    name_or_path: str | Path, *, mode: Mode | None = None, graph: GraphSpec | None = None, **options: Any
-) -> NetworkPolicy | RecurrentPolicy | TrainedPlanner:
+    name_or_path: str | Path,
+    *,
+    mode: Mode | None = None,
+    graph: GraphSpec | None = None,
+    runtime: Runtime = "torch",
+    **options: Any,
+) -> AnyPolicy:
     """A trained policy by its shipped name, or by the path of its weights or its card.
 
-    `mode` is `greedy` or `sample`, None: as its card says. One whose network has a memory is a RecurrentPolicy, one
+    `mode` is `greedy` or `sample`, None: as its card says. One whose network has a memory is a RecurrentScheduler, one
     that plans whole rounds a TrainedPlanner, to which `options` go. With a `graph` a policy that was trained on another
-    metagraph is refused. Raises UnknownNameError for a name that does not
-    ship, InvalidFileError for damaged files, MarlSchedError without PyTorch.
+    metagraph is refused. `runtime` is what runs its network: `torch`, or `onnx`, onnxruntime on the NAME.onnx beside
+    the card. Raises UnknownNameError for a name that does not ship, InvalidFileError for damaged files, MarlSchedError
+    without the runtime.
     """
     path = policy_path(name_or_path)
+    require("runtime", runtime, get_args(Runtime))
     try:
-        from marl_sched.agents.policies.network_policy import TrainedPolicy
+        if runtime == "onnx":
+            from marl_sched.agents.policies.onnx_policy import load_onnx
+
+            return load_onnx(path, mode=mode, graph=graph, **options)
+        from marl_sched.agents.policies.network_policy import NetworkPolicy
+
+        return NetworkPolicy.load(path, mode=mode, graph=graph, **options)
     except ModuleNotFoundError as error:
-        if error.name not in ("torch", "safetensors"):
+        if error.name not in ("torch", "safetensors", "onnxruntime"):
             raise
+        extra = "light" if error.name == "onnxruntime" else "policies"
         raise MarlSchedError(
-            f"policy {name_or_path}: expected {error.name} to be installed: pip install 'marl-sched[policies]'"
+            f"policy {name_or_path}: expected {error.name} to be installed: pip install 'marl-sched[{extra}]'"
         ) from error
-    return TrainedPolicy.load(path, mode=mode, graph=graph, **options)
 
 
 def card_of(name_or_path: str | Path, domain: Domain | str) -> PolicyCard | None:
@@ -174,6 +194,11 @@ def _require_known(name_or_path: str | Path, domain: str) -> None:
             known = ", ".join(scheduler_names(domain))
             raise InvalidOptionError(f"scheduler {name}: is one of {other}, expected one of {domain}: {known}")
     raise UnknownNameError("scheduler", name, scheduler_names(domain))
+
+
+def is_policy(name_or_path: str | Path) -> bool:
+    """Whether that is the name of a policy that ships, or the path of one."""
+    return _is_path(name_or_path) or str(name_or_path) in shipped_policies()
 
 
 def _is_path(name_or_path: str | Path) -> bool:

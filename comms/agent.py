@@ -11,16 +11,12 @@ import logging
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import Any
 
-import numpy as np
-
-from marl_sched.agents.base import ObservationScheduler, Scheduler
-from marl_sched.agents.recurrent import LocalAgent, RecurrentScheduler
-from marl_sched.agents.registry import create_scheduler
+from marl_sched.comms.agent_options import AgentOptions
 from marl_sched.comms.metrics.throttle import ThrottledLog
-from marl_sched.comms.options import AgentOptions
+from marl_sched.comms.mind import PolicyMind
 from marl_sched.comms.process import interruptible, run_process
 from marl_sched.comms.protocol import events as ev
 from marl_sched.comms.protocol import messages as wire
@@ -28,60 +24,9 @@ from marl_sched.comms.protocol.agent_protocol import AgentProtocol
 from marl_sched.comms.protocol.rules import AgentRules
 from marl_sched.comms.transport.base import Transport
 from marl_sched.comms.transport.faulty import Faults, FaultyTransport
-from marl_sched.domain import LocalState, get_domain
-from marl_sched.errors import DeploymentError, InvalidMessageError, InvalidOptionError
+from marl_sched.errors import DeploymentError
 
 log = logging.getLogger(__name__)
-
-
-class PolicyMind:
-    """A domain's local state and the policy that decides on it; see Mind."""
-
-    def __init__(self, options: AgentOptions) -> None:
-        self._options = options
-        self._state: LocalState | None = None
-        self._decider: Decider | None = None
-
-    def meet(self, frame: wire.Frame) -> tuple[str, Sequence[str]]:
-        """See Mind.meet. Raises InvalidOptionError for an agent that does not exist or a policy that cannot decide."""
-        domain = get_domain(frame.env)
-        if self._options.agent >= frame.agents:
-            raise InvalidOptionError(
-                f"{domain.agent_name(self._options.agent)} does not exist: run {self._options.run!r} has "
-                f"{domain.agent_name(0)} to {domain.agent_name(frame.agents - 1)}"
-            )
-        if domain.telemetry is None:
-            raise DeploymentError(f"{frame.env} has no telemetry here: another version of this package?")
-        try:
-            self._state = domain.telemetry.local_state(frame.problem, self._options.agent)
-        except InvalidMessageError as error:
-            raise DeploymentError(f"the world's frame cannot be read: {error}") from error
-        if self._decider is None:
-            self._decider = decider_of(self._options.policy, domain)
-        return domain.agent_prefix, self._state.channels
-
-    def learn(self, channel: str, payload: bytes) -> None:
-        """See Mind.learn."""
-        self._known()[0].hear(channel, payload)
-
-    def forget(self) -> bool:
-        """See Mind.forget."""
-        return self._known()[1].forget()
-
-    def choose(self, noise: float) -> tuple[int, int | None]:
-        """The policy's action, and how many decisions its memory held before it; None without a memory."""
-        state, decider = self._known()
-        return decider.choose(state, noise)
-
-    def rehearse(self) -> None:
-        """Decide once and forget it: the first decision of a policy is slow."""
-        state, decider = self._known()
-        decider.rehearse(state)
-
-    def _known(self) -> tuple[LocalState, Decider]:
-        if self._state is None or self._decider is None:
-            raise RuntimeError("the world has not been met")
-        return self._state, self._decider
 
 
 class Agent:
@@ -152,78 +97,6 @@ class Agent:
                     self.transport.withdraw(key)
                 case ev.Warn(kind, text):
                     self._warnings.warn(kind, text, self._clock())
-
-
-class Decider(Protocol):
-    """Decides for one agent on what that was told."""
-
-    def choose(self, state: LocalState, noise: float) -> tuple[int, int | None]:
-        """The action, and how many decisions a memory held before it; None without a memory."""
-
-    def forget(self) -> bool:
-        """Begin with an empty memory, or without a plan; whether there is a memory at all."""
-
-    def rehearse(self, state: LocalState) -> None:
-        """Decide once and forget it."""
-
-
-class PolicyDecider:
-    """Decides by a policy on the agent's observation, with the agent's memory; see Decider."""
-
-    def __init__(self, policy: ObservationScheduler | RecurrentScheduler) -> None:
-        self._policy, self._agent = policy, LocalAgent(policy)
-
-    def choose(self, state: LocalState, noise: float) -> tuple[int, int | None]:
-        """See Decider.choose."""
-        remembered = self._agent.remembered
-        return self._agent.choose(state.observe(), noise), remembered
-
-    def forget(self) -> bool:
-        """See Decider.forget."""
-        self._agent.reset()
-        return self._agent.memory is not None
-
-    def rehearse(self, state: LocalState) -> None:
-        """See Decider.rehearse."""
-        LocalAgent(self._policy).choose(state.observe(), 0.5)
-
-
-class PlanDecider:
-    """Plans for the whole team, each agent for itself, on what it was told as a simulator; see Decider."""
-
-    def __init__(self, planner: Scheduler) -> None:
-        self._planner, self._begun = planner, False
-
-    def choose(self, state: LocalState, noise: float) -> tuple[int, int | None]:
-        """See Decider.choose. InvalidOptionError where the view hides something."""
-        simulator = state.simulator()
-        if simulator is None:
-            name = self._planner.name
-            raise InvalidOptionError(f"{name} plans for the whole team: expected a view that hides nothing")
-        if not self._begun:
-            self._planner.start(simulator, np.ones(1, np.bool_))
-            self._begun = True
-        return int(self._planner.decide(simulator)[0]), None
-
-    def forget(self) -> bool:
-        """See Decider.forget."""
-        self._begun = False
-        return False
-
-    def rehearse(self, state: LocalState) -> None:
-        """See Decider.rehearse."""
-        self.choose(state, 0.5)
-        self.forget()
-
-
-def decider_of(policy: str, domain: Any) -> Decider:
-    """What decides by a policy on what one agent is told; InvalidOptionError for a policy that needs more."""
-    scheduler = create_scheduler(policy, domain)
-    if isinstance(scheduler, ObservationScheduler | RecurrentScheduler):
-        return PolicyDecider(scheduler)
-    if scheduler.plans_on_estimates:
-        return PlanDecider(scheduler)
-    raise InvalidOptionError(f"{policy} needs more than an agent is told and cannot be deployed")
 
 
 def run(options: AgentOptions, progress: Any = None) -> Counter[str]:

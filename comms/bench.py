@@ -17,8 +17,8 @@ from typing import Any
 import msgspec
 import zenoh
 
-from marl_sched.comms.agent import decider_of
 from marl_sched.comms.launcher import deploy
+from marl_sched.comms.mind import decider_of
 from marl_sched.comms.options import DeployOptions, WorldOptions
 from marl_sched.comms.protocol.events import Choice, Outcome
 from marl_sched.comms.transport.endpoints import settle_port

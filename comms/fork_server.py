@@ -23,20 +23,24 @@ import time
 import traceback
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from marl_sched.comms.process import SIGNALS, call, end_with, leave, parse_options
 from marl_sched.comms.protocol.events import ExitCode
-from marl_sched.errors import MarlSchedError
+from marl_sched.errors import InvalidOptionError, MarlSchedError
 
+if TYPE_CHECKING:
+    from marl_sched.agents.policies.trained import Runtime
+
+Roles = dict[str, tuple[type, Callable[..., Any], Callable[[Any], int]]]  # role -> (options' type, body, exit code)
 GRACE = 4.0  # seconds that processes have to end when asked to, before they are killed
 TICK = 0.05
 
 
 class ForkServer:
-    """See the module's page. `roles`: role -> (options' type, body, exit code of its result)."""
+    """See the module's page."""
 
-    def __init__(self, roles: dict[str, tuple[type, Callable[..., Any], Callable[[Any], int]]]) -> None:
+    def __init__(self, roles: Roles) -> None:
         self._roles = roles
         self._pids: dict[int, str] = {}
         self._alive_read, self._alive_write = os.pipe()  # what ends the forked ones if this process is killed
@@ -143,11 +147,11 @@ def _redirect(log: Path, *, keep_stdout: bool) -> None:
         os.dup2(written, 1)
 
 
-def warm_up(world: Any, policies: list[str]) -> None:
+def warm_up(world: Any, policies: list[str], runtime: Runtime = "torch") -> None:
     """Import, load from disk and compile what the processes are about to use."""
     import numpy as np
 
-    from marl_sched.comms.agent import decider_of
+    from marl_sched.comms.mind import decider_of
     from marl_sched.comms.plant import SimulatedPlant
 
     plant = world.plant()
@@ -157,36 +161,62 @@ def warm_up(world: Any, policies: list[str]) -> None:
         if channel in local.channels:
             local.hear(channel, payload)
     for policy in policies:
-        decider_of(policy, world.domain).rehearse(local)
+        decider_of(policy, world.domain, runtime).rehearse(local)
     if isinstance(plant, SimulatedPlant):
         plant.simulator.observe(plant.simulator.acting)
         plant.simulator.step(np.zeros(1, np.int64))
 
 
-def main() -> None:
-    """The process: `python -m marl_sched.comms.fork_server '{"world": {...}, "policies": [...], "remove": null}'`.
+def warm_up_light(name: str, policies: list[str]) -> None:
+    """Import what the light agents of a domain are about to use, and nothing that they do without."""
+    from marl_sched.comms.mind import decider_of
+    from marl_sched.light import light_domain
 
-    `remove` is a folder that goes when the process ends.
+    domain = light_domain(name)
+    if domain is None:
+        raise InvalidOptionError(f"{name} has no light declaration")
+    for policy in policies:
+        decider_of(policy, domain)
+
+
+def main() -> None:
+    """The process: `python -m marl_sched.comms.fork_server ASKED`.
+
+    `ASKED` is `{"world": {...}, "policies": [...], "runtime": "torch" | "onnx", "remove": null}` for worlds and agents,
+    where `remove` is a folder that goes when the process ends; `{"light": DOMAIN, "policies": [...]}` for light agents.
     """
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
-    from marl_sched.comms import agent, world
-    from marl_sched.comms.options import AgentOptions, WorldOptions
-    from marl_sched.comms.transport import zenoh_session  # noqa: F401  (imported once, for all)
-
     asked = json.loads(sys.argv[1])
     try:
-        warm_up(parse_options(json.dumps(asked["world"]), WorldOptions), asked["policies"])
+        roles = _light_roles(asked) if "light" in asked else _roles(asked)
     except MarlSchedError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(ExitCode.USER_ERROR)
-    ForkServer(
-        {
-            "world": (WorldOptions, world.serve, world.exit_code_of),
-            "agent": (AgentOptions, agent.run, lambda counts: 0),
-        }
-    ).run()
-    if asked["remove"]:  # the run's private keys: they go even if the parent was killed
+    ForkServer(roles).run()
+    if asked.get("remove"):  # the run's private keys: they go even if the parent was killed
         shutil.rmtree(asked["remove"], ignore_errors=True)
+
+
+def _roles(asked: dict[str, Any]) -> Roles:
+    from marl_sched.comms import agent, world
+    from marl_sched.comms.agent_options import AgentOptions
+    from marl_sched.comms.options import WorldOptions
+    from marl_sched.comms.transport import zenoh_session  # noqa: F401  (imported once, for all)
+
+    warm_up(parse_options(json.dumps(asked["world"]), WorldOptions), asked["policies"], asked["runtime"])
+    return {
+        "world": (WorldOptions, world.serve, world.exit_code_of),
+        "agent": (AgentOptions, agent.run, lambda counts: 0),
+    }
+
+
+def _light_roles(asked: dict[str, Any]) -> Roles:
+    from marl_sched.comms import agent
+    from marl_sched.comms.agent_options import AgentOptions
+    from marl_sched.comms.transport import zenoh_session  # noqa: F401  (imported once, for all)
+
+    warm_up_light(asked["light"], asked["policies"])
+    return {"agent": (AgentOptions, agent.run, lambda counts: 0)}
 
 
 if __name__ == "__main__":

@@ -12,7 +12,8 @@ from collections.abc import Callable, Hashable, Sequence
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING
 
-from marl_sched.comms.options import AgentOptions, WorldOptions
+from marl_sched.comms.agent_options import AgentOptions
+from marl_sched.comms.options import WorldOptions
 from marl_sched.comms.protocol.events import Answered, Event, Queried, Received, TokenAppeared, TokenVanished
 from marl_sched.comms.protocol.rules import AgentRules
 from marl_sched.comms.transport.inbox import Inbox

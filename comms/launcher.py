@@ -6,73 +6,40 @@ growing delays and a limit; a world goes on from its log. If this process ends, 
 
 from __future__ import annotations
 
-import json
-import logging
-import os
 import queue
 import shutil
-import signal
-import subprocess
 import sys
 import tempfile
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import asdict, replace
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from msgspec import structs
 
+from marl_sched.agents.light import create_light_scheduler
+from marl_sched.agents.policies.trained import Runtime
 from marl_sched.agents.registry import create_scheduler, scheduler_names
+from marl_sched.comms.agent_options import AgentOptions
+from marl_sched.comms.children import BEING_STARTED, LEAVE, Child, ForkServerClient, Said
 from marl_sched.comms.metrics.report import SCHEMA, RunReport
-from marl_sched.comms.metrics.throttle import MAX_LINE
-from marl_sched.comms.options import AgentOptions, DeployOptions
-from marl_sched.comms.process import SIGNALS
+from marl_sched.comms.options import DeployOptions
 from marl_sched.comms.protocol.events import Ending, ExitCode
 from marl_sched.comms.security.certificates import make_certificates
 from marl_sched.comms.security.identity import WORLD, Identity
+from marl_sched.comms.stop_signals import stop_signals
 from marl_sched.comms.transport.endpoints import is_encrypted, settle_port
 from marl_sched.domain import Domain
 from marl_sched.errors import DeploymentError
 from marl_sched.files import read_json, write_json
+from marl_sched.light import light_domain
 
-log = logging.getLogger(__name__)
 POLL = 0.05  # seconds between two looks at the processes
-LEAVE = 10.0  # seconds that processes have to leave when the run is over or interrupted
 FIRST_DELAY, LAST_DELAY, STEADY = 0.1, 5.0, 30.0  # seconds: until a restart, at most, and alive until that is forgotten
-BEING_STARTED = -1  # in place of a process's id
+AGENT = "agent"  # the role of all processes but the world's
 Progress = Callable[[str, int, int], None]  # (phase, how much of the horizon has passed, horizon)
-
-
-@dataclass
-class Child:
-    """A process of the deployment, through all its restarts.
-
-    Attributes:
-        pid: of the process that runs, 0 if none does, BEING_STARTED until the fork server says.
-        exit_code: of the last one that ended, negative after a signal, None if none did.
-        restarts: how often it was started again; `in_a_row` without having been steady.
-        restart_at: when it is to be started again.
-    """
-
-    name: str
-    log: Path  # what it writes to stderr
-    start: Callable[[], None]
-    pid: int = 0
-    exit_code: int | None = None
-    restarts: int = 0
-    in_a_row: int = 0
-    started_at: float = 0.0
-    restart_at: float | None = None
-
-    def complaint(self) -> str:
-        """The last line that it wrote to stderr."""
-        text = self.log.read_text(encoding="utf-8", errors="replace") if self.log.exists() else ""
-        lines = text.strip().splitlines()
-        return lines[-1].removeprefix("error: ") if lines else "it said nothing"
 
 
 class Deployment:
@@ -93,15 +60,15 @@ class Deployment:
         self.policies = options.policies(self._n_agents)
         self.started_here = options.started_here(self._n_agents)
         for policy in sorted(set(self.policies)):
-            _check_policy(policy, options.world.domain)
+            _check_policy(policy, options.world.domain, options.runtime)
         self.endpoint = settle_port(options.world.listen)
         self.certs, self.routes = options.world.certs, dict[int, str]()
         if self.certs:
             self._check_certificates(Path(self.certs))
         self.children: dict[str, Child] = {}
         self.phase, self.tick, self.horizon = "starting", 0, options.world.problem.horizon
-        self._said: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
-        self._server: subprocess.Popen[bytes] | None = None
+        self._said: queue.SimpleQueue[Said] = queue.SimpleQueue()
+        self._servers: dict[str, ForkServerClient] = {}  # by role
         self._kept, self._own_certs = bool(options.folder), ""
 
     def __enter__(self) -> Deployment:
@@ -116,7 +83,7 @@ class Deployment:
             if is_encrypted(self.endpoint) and not self.certs:
                 self.certs = self._own_certs = tempfile.mkdtemp(prefix="marl_sched-certs-")
                 make_certificates(Path(self.certs), [self._name(agent) for agent in range(self._n_agents)])
-            self._start_server()
+            self._start_servers()
             self._add(WORLD, self.start_world)
             for agent in self.started_here:
                 self._add(self._name(agent), lambda agent=agent: self.start_agent(agent))  # type: ignore[misc]  # a bound default
@@ -136,46 +103,33 @@ class Deployment:
         for name in (WORLD, *(self._name(agent) for agent in self.started_here)):
             Identity(folder, name)
 
-    def _start_server(self) -> None:
+    def _start_servers(self) -> None:
         world = replace(self.options.world, listen=self.endpoint)
-        asked = json.dumps(
-            {"world": world.as_json(), "policies": sorted(set(self.policies)), "remove": self._own_certs or None}
+        policies, runtime = sorted(set(self.policies)), self.options.runtime
+        light = runtime == "onnx" and light_domain(world.domain.name) is not None
+        self._servers[WORLD] = ForkServerClient(
+            {
+                "world": world.as_json(),
+                "policies": [] if light else policies,
+                "runtime": runtime,
+                "remove": self._own_certs or None,
+            },
+            self.folder / "fork_server.log",
+            self._said,
         )
-        with (self.folder / "fork_server.log").open("ab") as log:
-            self._server = subprocess.Popen(
-                [sys.executable, "-P", "-m", "marl_sched.comms.fork_server", asked],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=log,
-                env={**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"},
-                start_new_session=True,  # Ctrl-C reaches this process alone, which then ends the others
+        self._servers[AGENT] = self._servers[WORLD]
+        if light:
+            self._servers[AGENT] = ForkServerClient(
+                {"light": world.domain.name, "policies": policies},
+                self.folder / "fork_server_light.log",
+                self._said,
             )
-        threading.Thread(target=self._listen, args=(self._server.stdout,), daemon=True).start()
 
-    def _listen(self, lines: Any) -> None:
-        """Take in what the fork server and the world say; a line that neither of them wrote is logged."""
-        for line in lines:
-            try:
-                said = json.loads(line)
-            except ValueError:
-                said = None
-            if isinstance(said, dict):
-                self._said.put(said)
-            else:
-                log.warning("a process of the run wrote a line that is no report of it: %r", line[:MAX_LINE])
-        self._said.put(None)
-
-    def _order(self, **order: Any) -> None:
-        if self._server is None or self._server.stdin is None:
+    def _server_of(self, name: str) -> ForkServerClient:
+        role = WORLD if name == WORLD else AGENT
+        if role not in self._servers:
             raise DeploymentError("the deployment has not been started")
-        try:
-            self._server.stdin.write(json.dumps(order).encode() + b"\n")
-            self._server.stdin.flush()
-        except BrokenPipeError as error:
-            raise DeploymentError(f"no process could be started: {self._server_complaint()}") from error
-
-    def _server_complaint(self) -> str:
-        return Child("fork server", self.folder / "fork_server.log", lambda: None).complaint()
+        return self._servers[role]
 
     def _add(self, name: str, start: Callable[[], None]) -> None:
         self.children[name] = Child(name, self.folder / f"{name}.log", start)
@@ -188,7 +142,7 @@ class Deployment:
         options = replace(
             self.options.world, listen=self.endpoint, report=str(self.report_path), log=log, certs=self.certs
         )
-        self._start(WORLD, "world", options.as_json())
+        self._start(WORLD, WORLD, options.as_json())
 
     def start_agent(self, agent: int) -> None:
         """Start an agent's process; again, if it has died."""
@@ -201,17 +155,18 @@ class Deployment:
             join_timeout=self.options.world.ready_timeout,
             lease=self.options.world.lease,
             faults=dict(self.options.world.faults),
+            runtime=self.options.runtime,
         )
-        self._start(self._name(agent), "agent", asdict(options))
+        self._start(self._name(agent), AGENT, asdict(options))
 
     def _start(self, name: str, role: str, options: dict[str, Any]) -> None:
         child = self.children[name]
         child.pid, child.restart_at, child.started_at = BEING_STARTED, None, time.monotonic()
-        self._order(start=name, role=role, options=options, log=str(child.log))
+        self._server_of(name).order(start=name, role=role, options=options, log=str(child.log))
 
     def signal(self, name: str, number: int) -> None:
         """Send a signal to a child that runs."""
-        self._order(signal=name, number=number)
+        self._server_of(name).order(signal=name, number=number)
 
     def look(self, timeout: float = 0.0) -> None:
         """Take in what has happened, start again what died; wait up to `timeout` seconds for something to happen."""
@@ -221,8 +176,8 @@ class Deployment:
             except queue.Empty:
                 break
             timeout = 0.0
-            if said is None:
-                raise DeploymentError(f"no process could be started: {self._server_complaint()}")
+            if isinstance(said, ForkServerClient):
+                raise said.failed()
             self._take_in(said)
         now = time.monotonic()
         for child in self.children.values():
@@ -291,15 +246,8 @@ class Deployment:
 
     def close(self) -> None:
         """End all processes: their fork server asks, waits, and kills."""
-        server = self._server
-        if server is not None:
-            if server.stdin is not None:
-                server.stdin.close()
-            try:
-                server.wait(LEAVE)
-            except subprocess.TimeoutExpired:
-                server.kill()
-                server.wait()
+        for server in set(self._servers.values()):
+            server.close()
         if self._own_certs:
             shutil.rmtree(self._own_certs, ignore_errors=True)  # the fork server may have removed it already
         if not self._kept:
@@ -329,7 +277,7 @@ def deploy(
     report: RunReport | None = None
     failed: dict[str, Any] | None = None
     try:
-        with _signals() as stopped:
+        with stop_signals() as stopped:
             import marl_sched.comms.transport.zenoh_session  # noqa: F401  (not installed: missed here, not in a child)
 
             deployment = Deployment(options)
@@ -368,36 +316,9 @@ def _no_report(options: DeployOptions, ending: Ending, reason: str, code: int) -
     }
 
 
-def _check_policy(policy: str, domain: Domain) -> None:
+def _check_policy(policy: str, domain: Domain, runtime: Runtime) -> None:
     """Raise what an agent would say of a policy that does not exist, without loading one that does."""
-    if policy not in scheduler_names(domain.name) and not Path(policy).exists():
+    if runtime == "onnx" and (light := light_domain(domain.name)) is not None:
+        create_light_scheduler(policy, light)
+    elif policy not in scheduler_names(domain.name) and not Path(policy).exists():
         create_scheduler(policy, domain)
-
-
-@dataclass
-class Stop:
-    """Which signal has come. While nothing waits for it, a signal unwinds the stack instead."""
-
-    number: int | None = None
-    waiting: bool = False
-
-
-@contextmanager
-def _signals() -> Iterator[Stop]:
-    """Take SIGINT, SIGTERM and SIGHUP, so that context managers end the processes; only in the main thread."""
-    stop = Stop()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-
-    def note(number: int, frame: FrameType | None) -> None:
-        again, stop.number = stop.number is not None, number
-        if again or not stop.waiting:
-            sys.exit(128 + number)
-
-    before = {number: signal.signal(number, note) for number in SIGNALS}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

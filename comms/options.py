@@ -1,4 +1,4 @@
-"""What a world, an agent and a whole deployment can be told, checked before anything starts."""
+"""What a world and a whole deployment can be told, checked before anything starts."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
+from marl_sched.agents.policies.trained import Runtime
+from marl_sched.comms.agent_options import DEFAULT_ENDPOINT, require_positive
 from marl_sched.comms.protocol.keys import run_prefix
 from marl_sched.comms.protocol.rules import ClockKind, WorldRules
 from marl_sched.comms.security.identity import WORLD, Identity
@@ -21,7 +23,6 @@ if TYPE_CHECKING:
     from marl_sched.comms.plant import Plant, SimulatedPlant
     from marl_sched.simulation import TurnSimulator
 
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 INSECURE = (
     "nothing is encrypted and nobody shows a certificate: whoever reaches {} can answer in an agent's name and hear "
     "what all agents hear"
@@ -97,7 +98,7 @@ class WorldOptions:
         require("conflict", self.conflict, get_args(Conflict))
         require("clock", self.clock, get_args(ClockKind))
         require("sync", self.sync, get_args(Sync))
-        _require_positive(self, "pace", "deadline", "standstill", "ready_timeout", "heartbeat", "lease")
+        require_positive(self, "pace", "deadline", "standstill", "ready_timeout", "heartbeat", "lease")
         if self.patience < 1:
             raise InvalidOptionError(f"patience: expected at least 1 missed deadline, got {self.patience}")
         if self.grace is not None and not self.grace >= 0:
@@ -169,48 +170,6 @@ class WorldOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class AgentOptions:
-    """One agent: who it is, what decides for it, and where its world is.
-
-    Attributes:
-        agent: its index.
-        policy: a scheduler's name or a checkpoint's path.
-        run, connect: the world's `run` and endpoint.
-        certs: folder with the authority's certificate and this agent's, which a `tls/` endpoint needs.
-        join_timeout: seconds to wait for the world, at the start and when it has been lost.
-        lease: a link that is silent for that many seconds counts as dead.
-        faults: what happens to its messages, see `Faults`.
-    """
-
-    agent: int
-    policy: str
-    run: str = "run"
-    connect: str = DEFAULT_ENDPOINT
-    certs: str = ""
-    join_timeout: float = 60.0
-    lease: float = 1.0
-    faults: Mapping[str, float] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        """Refuse what cannot be run."""
-        run_prefix(self.run)
-        Faults.of(self.faults)
-        _require_positive(self, "join_timeout", "lease")
-        if self.agent < 0:
-            raise InvalidOptionError(f"agent: expected an index >= 0, got {self.agent}")
-
-    def identity(self) -> Identity | None:
-        """The agent's certificate, None without `certs`; InvalidOptionError for a folder that lacks it."""
-        if not self.certs:
-            return None
-        found = sorted(path.stem for path in Path(self.certs).glob(f"*_{self.agent}.pem"))
-        if len(found) != 1:
-            what = f"one certificate of agent {self.agent}, such as crew_{self.agent}.pem"
-            raise InvalidOptionError(f"certs: {self.certs}: expected {what}, found {', '.join(found) or 'none'}")
-        return Identity(Path(self.certs), found[0])
-
-
-@dataclass(frozen=True, kw_only=True)
 class DeployOptions:
     """A world and all its agents on this machine.
 
@@ -223,6 +182,7 @@ class DeployOptions:
         folder: where logs of all processes, the run's log and the report are kept; "": in a temporary folder, which
             is left only if the run did not end well.
         restarts: how often in a row a process that died is started again.
+        runtime: by what agents decide, see AgentOptions.
     """
 
     world: WorldOptions
@@ -231,6 +191,7 @@ class DeployOptions:
     agents: tuple[str, ...] = ()
     folder: str = ""
     restarts: int = 5
+    runtime: Runtime = "torch"
 
     def __post_init__(self) -> None:
         """Refuse what cannot be run."""
@@ -239,6 +200,7 @@ class DeployOptions:
                 f"listen: on {self.world.listen} {INSECURE.format('it')}. Listen on tls/, or say --insecure "
                 "(insecure: true) if that is what you want"
             )
+        require("runtime", self.runtime, get_args(Runtime))
         if self.restarts < 0:
             raise InvalidOptionError(f"restarts: expected an integer >= 0, got {self.restarts}")
 
@@ -258,10 +220,3 @@ class DeployOptions:
 
     def _names(self, n_agents: int) -> list[str]:
         return [self.world.domain.agent_name(i) for i in range(n_agents)]
-
-
-def _require_positive(options: Any, *names: str) -> None:
-    for name in names:
-        value = getattr(options, name)
-        if not value > 0:
-            raise InvalidOptionError(f"{name}: expected a number > 0 (seconds), got {value}")

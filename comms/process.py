@@ -21,7 +21,6 @@ import msgspec
 from marl_sched.comms.protocol.events import ExitCode, Interrupted
 from marl_sched.comms.transport.base import Transport
 from marl_sched.errors import InvalidOptionError, MarlSchedError
-from marl_sched.problem import Problem
 
 T = TypeVar("T")
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -43,6 +42,8 @@ def parse_options(text: str, kind: type[T]) -> T:
 
 def _decode(kind: type, content: Any) -> Any:
     """Msgspec's hook for what is no plain value."""
+    from marl_sched.problem import Problem
+
     if kind is Problem:
         return Problem.from_json(content)
     raise NotImplementedError(kind)

@@ -7,3 +7,6 @@ DOMAINS = {
     "murse": "marl_sched.envs.murse.domain:MURSE",
     "ward": "marl_sched.envs.ward.domain:WARD",
 }
+
+# Those of them whose agents can do without Numba (marl_sched.light): name -> their light declaration.
+LIGHT_DOMAINS = {"airme": "marl_sched.envs.airme.light:AIRME"}

@@ -5,17 +5,16 @@
     env = marl_sched.airme_v0.env()                         # PettingZoo AEC
     policy = marl_sched.load_policy("airme-local-profit")   # needs torch, the environments do not
 
-Importing this package registers its environments with Gymnasium and imports nothing else; each name is loaded
-when it is first used.
+Importing this package imports nothing else; each name is loaded when it is first used. Its environments are registered
+with Gymnasium and PettingZoo as soon as these are imported, before or after it.
 """
 
 from __future__ import annotations
 
-import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from marl_sched.gymnasium_ids import register as _register
+from marl_sched.when_imported import when_imported as _when_imported
 
 if TYPE_CHECKING:
     from marl_sched import airme_v0 as airme_v0
@@ -52,8 +51,5 @@ def __dir__() -> list[str]:
     return sorted(set(globals()) | set(__all__))
 
 
-_register()
-if "pettingzoo" in sys.modules:
-    from marl_sched.pettingzoo_ids import register as _register_with_pettingzoo
-
-    _register_with_pettingzoo()
+_when_imported("gymnasium", lambda: import_module("marl_sched.gymnasium_ids").register())
+_when_imported("pettingzoo", lambda: import_module("marl_sched.pettingzoo_ids").register())

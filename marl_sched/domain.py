@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, get_type_hints
 import numpy as np
 
 from marl_sched.errors import InvalidOptionError, MarlSchedError, require
-from marl_sched.noise import Split, instance_generator
 from marl_sched.plugins import DOMAINS, import_object, load_offered, offered
 from marl_sched.privileged import PrivilegedInfo
 
@@ -27,6 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from marl_sched.graph import GraphSpec
+    from marl_sched.noise import Split
     from marl_sched.planning import Advice, Schedules
     from marl_sched.sheets import Sheet
     from marl_sched.simulation import TurnSimulator
@@ -290,6 +290,8 @@ class Domain:
 
         Raises UnknownNameError for the scale or the split, InvalidOptionError for a seed outside [0, 2**63).
         """
+        from marl_sched.noise import instance_generator
+
         self.require_scale(scale)
         return [self.generate(scale, instance_generator(seed, i, split)) for i in range(count)]
 

@@ -1,4 +1,5 @@
-"""The names under which Gymnasium knows the centralised environments; importing `marl_sched` registers them.
+"""The names under which Gymnasium knows the centralised environments; importing `marl_sched` and
+Gymnasium, in either order, registers them.
 
 A domain of another distribution is known by its entry point: `couriers` as `marl_sched/Couriers-v0`, `night-shift` as
 `marl_sched/NightShift-v0`. Nothing is imported here: an environment's module is loaded when it is made.

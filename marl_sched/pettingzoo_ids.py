@@ -1,7 +1,7 @@
 """The names under which PettingZoo's registry knows the environments, where the installed PettingZoo has one.
 
 import pettingzoo
-from marl_sched import airme_v0                  # registers marl_sched/AirME-v0 for "aec" and "parallel"
+import marl_sched                                # registers marl_sched/AirME-v0 for "aec" and "parallel"
 
 env = pettingzoo.make("aec", "marl_sched/AirME-v0", scale="small")
 """

@@ -15,7 +15,7 @@ import numpy as np
 from marl_sched.agents.airme.ranking import CORRECTIVE, Known, Ranking, rank, ranking
 from marl_sched.compiled import entry
 from marl_sched.envs.airme.dynamics import begin_step, decide, pass_hours, require_consistent, take_turn
-from marl_sched.envs.airme.graph import INCOME_SCALE, PER_INCOME
+from marl_sched.envs.airme.features import INCOME_SCALE, PER_INCOME
 from marl_sched.envs.airme.simulator import AirmeSimulator, example
 from marl_sched.envs.airme.state import IDLE, SINGLE, SKIP, UNDECIDED, Record, Rules, State
 from marl_sched.envs.airme.views import ring_distance

@@ -15,12 +15,12 @@ from typing import NamedTuple
 import numpy as np
 
 from marl_sched.agents.airme.bound.plane import BROKEN, HOURS_CAP, LANDINGS_CAP
+from marl_sched.agents.airme.thresholds import FIRST
 from marl_sched.compiled import entry
-from marl_sched.envs.airme.graph import PLANE
+from marl_sched.envs.airme.features import PLANE
 from marl_sched.kernels import kernel
 
 CORRECTIVE, CORRECTIVE_AS_PUBLISHED, CONDITION, PERIODIC, MODEL_BASED, PREVENTIVE_FIRST, INDEX = range(7)
-FIRST = 1e9  # added to the rank of planes that go before all others
 _NAMES = ("hours", "landings", "income", "broken", "mission_hours", "mission_done")
 HOURS, LANDINGS, _INCOME, _BROKEN, _MISSION, _DONE = map(PLANE.index, _NAMES)
 _PER_HOUR, _PER_LANDING, _PER_INCOME, _, _PER_MISSION, _PER_DONE = map(PLANE.scale, _NAMES)

@@ -14,23 +14,19 @@ from typing import cast
 
 import numpy as np
 
-from marl_sched.agents.airme import ranking
+from marl_sched.agents.airme import ranking, thresholds
 from marl_sched.agents.airme.bound.index import require_types
 from marl_sched.agents.airme.epochs import EpochPlayer
 from marl_sched.agents.airme.ranking import N_FEATURES, Ranking
 from marl_sched.agents.base import ObservationScheduler, Worths, best_action
 from marl_sched.envs.airme.aircraft import PUBLISHED_TYPES, AircraftType, FailureModel, failure_table
-from marl_sched.envs.airme.graph import PLANE
+from marl_sched.envs.airme.features import PLANE
 from marl_sched.envs.airme.simulator import AirmeSimulator
 from marl_sched.errors import InvalidOptionError
 from marl_sched.privileged import PrivilegedInfo
 from marl_sched.simulation import TurnSimulator
 
 Observation = Mapping[str, np.ndarray]
-_PERIOD = 6  # hours, periodic
-_HOURS_THRESHOLD = 40.0  # condition-based
-_FAILURE_THRESHOLD = 0.004  # model-based
-_PREVENTIVE_HOURS, _PREVENTIVE_LANDINGS = 45.0, 4.0
 _NO_FAILURES = np.zeros((1, 1, 1))
 
 
@@ -53,8 +49,8 @@ class PriorityRule(ObservationScheduler):
         observation = simulator.observe(simulator.acting)
         ranks = ranking.rank_observation(observation, self._failures(observation["plane"]), self.ranking)
         ranks = np.where(ranks > self.ranking.least, ranks, -np.inf)
-        first = ranks >= ranking.FIRST
-        return Worths(np.where(first, ranks - ranking.FIRST, ranks), f"what {self.name} ranks by", first=first)
+        first = ranks >= thresholds.FIRST
+        return Worths(np.where(first, ranks - thresholds.FIRST, ranks), f"what {self.name} ranks by", first=first)
 
     def epoch_player(self, simulator: TurnSimulator) -> EpochPlayer:
         """What plays this rule's decision epochs in one call."""
@@ -65,24 +61,10 @@ class PriorityRule(ObservationScheduler):
         return _NO_FAILURES
 
 
-class RandomRule(ObservationScheduler):
-    """Any plane that may be chosen or the null plane, all alike."""
-
-    name = "random"
-    heeds_objective = False
-    samples = True
-
-    def choose(self, observation: Observation, uniform: np.ndarray) -> np.ndarray:
-        """Actions int64 (B,) by inverse distribution from `uniform` float64 (B,)."""
-        legal = np.asarray(observation["action_mask"]) > 0
-        rank = np.floor(uniform * legal.sum(axis=1)).astype(np.int64)
-        return (legal.cumsum(axis=1) > rank[:, None]).argmax(axis=1).astype(np.int64)
-
-
 class PeriodicRule(PriorityRule):
     """Acts only in hours that are multiples of the period; then serves broken planes, then all others by hours."""
 
-    def __init__(self, period: int = _PERIOD) -> None:
+    def __init__(self, period: int = thresholds.PERIOD) -> None:
         if period < 1:
             raise InvalidOptionError(f"periodic: period: expected at least 1 hour, got {period}")
         super().__init__("periodic", ranking.ranking(ranking.PERIODIC, period=period))
@@ -98,7 +80,7 @@ def corrective_as_published() -> PriorityRule:
     return PriorityRule("corrective-published", ranking.ranking(ranking.CORRECTIVE_AS_PUBLISHED))
 
 
-def condition(threshold: float = _HOURS_THRESHOLD) -> PriorityRule:
+def condition(threshold: float = thresholds.HOURS) -> PriorityRule:
     """Broken planes by income, then unbroken ones with at least `threshold` operating hours, by hours."""
     return PriorityRule("condition", ranking.ranking(ranking.CONDITION, hours=threshold))
 
@@ -115,7 +97,7 @@ class ModelBasedRule(PriorityRule):
 
     def __init__(
         self,
-        threshold: float = _FAILURE_THRESHOLD,
+        threshold: float = thresholds.FAILURE,
         types: Sequence[AircraftType] = PUBLISHED_TYPES,
         failure: FailureModel = "density",
     ) -> None:
@@ -142,7 +124,9 @@ def _failure_table(types: tuple[AircraftType, ...], failure: FailureModel, bits:
     return failure_table(types, (1 << bits) - 1, failure)
 
 
-def preventive_first(hours: float = _PREVENTIVE_HOURS, landings: float = _PREVENTIVE_LANDINGS) -> PriorityRule:
+def preventive_first(
+    hours: float = thresholds.PREVENTIVE_HOURS, landings: float = thresholds.PREVENTIVE_LANDINGS
+) -> PriorityRule:
     """Worn planes before broken ones: it keeps the backlog of long repairs from eating the crews.
 
     Fixed-wing planes (type 0) from `hours` operating hours and all others from `landings` landings on come first, by

@@ -6,10 +6,10 @@ from collections.abc import Callable
 from functools import partial
 
 from marl_sched.agents.airme.bound.index import IndexScheduler
+from marl_sched.agents.airme.light_rules import RandomRule
 from marl_sched.agents.airme.rules import (
     ModelBasedRule,
     PeriodicRule,
-    RandomRule,
     condition,
     corrective,
     corrective_as_published,

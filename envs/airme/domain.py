@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from marl_sched.domain import Demo, Domain
 from marl_sched.envs.airme import render
-from marl_sched.envs.airme.graph import pressing
+from marl_sched.envs.airme.features import pressing
 from marl_sched.envs.airme.instance import SCALES, AirmeInstance, decode, generate, load
 from marl_sched.envs.airme.simulator import DEFAULT_HORIZON, AirmeSimulator
 from marl_sched.envs.airme.state import OBJECTIVES

@@ -26,8 +26,8 @@ from marl_sched.envs.airme.state import (
     Record,
     Rules,
     State,
-    Stream,
 )
+from marl_sched.envs.airme.streams import Stream
 from marl_sched.kernels import kernel
 from marl_sched.noise import integer, time_key, uniform
 

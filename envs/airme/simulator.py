@@ -10,6 +10,7 @@ import numpy as np
 from marl_sched.compiled import entry
 from marl_sched.envs.airme import dynamics, graph
 from marl_sched.envs.airme.aircraft import PUBLISHED_TYPES, AircraftType, FailureModel, failure_table
+from marl_sched.envs.airme.features import graph_spec
 from marl_sched.envs.airme.instance import SCALES, AirmeInstance
 from marl_sched.envs.airme.state import (
     BEGUN,
@@ -81,7 +82,7 @@ class AirmeSimulator(TurnSimulator):
         planes = SCALES[pad].max_planes if pad else max(i.n_planes for i in self.instances)
         crews = SCALES[pad].crews[1] if pad else max(i.n_crews for i in self.instances)
         self.max_actions, self.max_agents = planes + 1, crews
-        self.graph = graph.graph_spec(len(self.types))
+        self.graph = graph_spec(len(self.types))
         self.arrays = self.graph.arrays({"plane": planes + 1, "crew": crews})
         self.state = _new_state(self.batch, planes, crews, horizon, self.view.memory, record_timeline)
         self.rules = Rules(

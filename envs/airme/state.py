@@ -6,12 +6,9 @@ hours and float64 money.
 
 from __future__ import annotations
 
-from enum import IntEnum
 from typing import Any, NamedTuple
 
 import numpy as np
-
-from marl_sched.noise import FIRST_DOMAIN_STREAM
 
 Record = Any  # one element of a record array, whose fields compiled code reads as attributes
 
@@ -60,6 +57,7 @@ ROW = np.dtype(
 )
 
 IDLE, UNDECIDED = 0, -1
+EVERYWHERE = 1 << 30  # of a view: so far that it reaches all
 PROFIT, REVENUE, AVAILABILITY = 0, 1, 2
 OBJECTIVES = ("profit", "revenue", "availability")
 FULL, SKIP, SINGLE = 0, 1, 2
@@ -94,14 +92,3 @@ class Rules(NamedTuple):
     scheme: int  # FULL, SKIP or SINGLE, section 6.3.1
     horizon: int  # hours
     stop_share: float  # the episode ends when this share of planes is broken, 0: never
-
-
-class Stream(IntEnum):
-    """Streams of AirME's noise; the entity is the plane's slot, for VIEW which of a view's numbers."""
-
-    REPAIR_HOURS = FIRST_DOMAIN_STREAM
-    REPAIR_COST = FIRST_DOMAIN_STREAM + 1
-    MISSION = FIRST_DOMAIN_STREAM + 2
-    MISSION_HOURS = FIRST_DOMAIN_STREAM + 3
-    FAILURE = FIRST_DOMAIN_STREAM + 4  # draw = part
-    VIEW = FIRST_DOMAIN_STREAM + 5  # at time 0

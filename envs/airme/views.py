@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from marl_sched.envs.airme.state import Stream
+from marl_sched.envs.airme.state import EVERYWHERE
+from marl_sched.envs.airme.streams import Stream
 from marl_sched.errors import InvalidOptionError, require_integer
 from marl_sched.kernels import kernel
 from marl_sched.noise import integer, time_key, uniform
 
-EVERYWHERE = 1 << 30
 MOST_STALENESS = 8760  # hours: a year, of which a simulator keeps one snapshot an hour
 
 Limits = tuple[int, int, int]  # reach, comm, staleness

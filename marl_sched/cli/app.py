@@ -76,6 +76,9 @@ EXTRAS = {
     "tensorboard": "train",
     "zenoh": "deploy",
     "cryptography": "deploy",
+    "onnxruntime": "light",
+    "onnx": "onnx-export",
+    "onnxscript": "onnx-export",
     "ortools": "solvers",
     "matplotlib": "plots",
 }

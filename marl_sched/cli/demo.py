@@ -32,7 +32,7 @@ def demo(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for results and plots.")] = Path("out/demo"),
 ) -> None:
     """Deploy a policy with a local view, a process per agent, and compare it with schedulers that see everything."""
-    from marl_sched.cli.deployment import print_report
+    from marl_sched.cli.run_printing import print_report
     from marl_sched.cli.tables import print_scores
     from marl_sched.domain import get_domain
     from marl_sched.files import write_json
@@ -94,7 +94,7 @@ def deployed_problem(domain: Domain, policy: str) -> Problem:
 
 
 def _deploy(policy: str, problem: Problem, path: Path) -> RunReport:
-    from marl_sched.cli.deployment import progress_bar
+    from marl_sched.cli.run_printing import progress_bar
     from marl_sched.comms.launcher import deploy
     from marl_sched.comms.options import DeployOptions, WorldOptions
 

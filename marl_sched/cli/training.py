@@ -1,4 +1,4 @@
-"""`marl-sched train`, `resume`, `export` and `curves`: policies learn and are measured."""
+"""`marl-sched train`, `resume`, `export`, `export-onnx` and `curves`: policies learn and are measured."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ def add_to(app: typer.Typer) -> None:
     app.command(epilog="Example: marl-sched train view=local view.reach=1 algorithm=gae seed=1")(train)
     app.command(epilog="Example: marl-sched resume runs/mine")(resume)
     app.command(epilog="Example: marl-sched export runs/mine my-policy --out policies")(export)
+    app.command("export-onnx", epilog="Example: marl-sched export-onnx policies/my-policy.json")(export_onnx)
     app.command(epilog="Example: marl-sched curves runs/gae-0 runs/gae-1 runs/ippo-0 --out curves.png")(curves)
 
 
@@ -74,6 +75,22 @@ def export(
         means = ", ".join(f"{name} {mean:.4f}" if len(found) > 1 else f"{mean:.4f}" for name, mean in found.items())
         typer.echo(f"{scale}: M1 {means}")
     typer.echo(path)
+
+
+def export_onnx(
+    policy: Annotated[str, typer.Argument(metavar="POLICY", help="A shipped policy's name, or a checkpoint's path.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE", help="What to write (default: NAME.onnx beside its card).")
+    ] = None,
+) -> None:
+    """Write a policy for onnxruntime, by which agents decide without PyTorch (`deploy --runtime onnx`)."""
+    from marl_sched.agents.policies.onnx_export import export_onnx as write
+    from marl_sched.agents.registry import policy_path
+
+    path = policy_path(policy)
+    target = path.with_suffix(".onnx") if out is None else out
+    options.check_output(target, "--out")
+    typer.echo(write(path, target))
 
 
 def curves(

@@ -14,7 +14,7 @@ from marl_sched.agents.networks.hetgat.network import HetGATNetwork
 from marl_sched.agents.policies.cards import PolicyCard
 from marl_sched.agents.policies.checkpoint import save_network
 from marl_sched.agents.policies.network_policy import NetworkPolicy
-from marl_sched.envs.airme.graph import graph_spec
+from marl_sched.envs.airme.features import graph_spec
 from marl_sched.errors import InvalidFileError, InvalidOptionError, UnknownNameError
 
 RULES = ["random", "corrective", "corrective-published", "condition", "periodic", "model-based", "preventive-first"]

@@ -9,6 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from marl_sched.domain import get_domain
+from marl_sched.envs.airme import numpy_view
+from marl_sched.envs.airme.local_state import AirmeLocalState
+from marl_sched.envs.airme.messages import Frame, decode
 from marl_sched.envs.airme.simulator import AirmeSimulator
 from marl_sched.envs.airme.views import FullView, LocalView, RandomView
 from marl_sched.errors import InvalidMessageError
@@ -57,11 +60,14 @@ def assert_equal(believed, seen, where) -> None:
 @settings(max_examples=4)
 def test_local_state_equals_observation_of_every_crew_at_every_turn(view, seed):
     sim, rng = simulator(view, seed=seed % 50, pad="small"), np.random.default_rng(seed)
-    crews = local_states(sim)
+    crews, frame = local_states(sim), decode(TELEMETRY.frame(sim), Frame)
+    without_numba = [AirmeLocalState(frame, agent, numpy_view.observe) for agent in range(len(crews))]
     while not sim.over[0]:
         said = TELEMETRY.messages(sim)
         for agent, local_state in enumerate(crews):
-            assert_equal(tell(local_state, said), sim.observe(np.array([agent])), (agent, int(sim.time[0])))
+            seen = sim.observe(np.array([agent]))
+            assert_equal(tell(local_state, said), seen, (agent, int(sim.time[0])))
+            assert_equal(tell(without_numba[agent], said), seen, (agent, int(sim.time[0]), "NumPy"))
         play_at_random(sim, rng)
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from marl_sched.envs.airme.graph import graph_spec
+from marl_sched.envs.airme.features import graph_spec
 from marl_sched.envs.airme.instance import AirmeInstance, generate
 from marl_sched.envs.airme.simulator import AirmeSimulator
 from marl_sched.envs.airme.state import UNDECIDED

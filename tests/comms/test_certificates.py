@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from marl_sched.comms.options import AgentOptions, DeployOptions, WorldOptions
+from marl_sched.comms.agent_options import AgentOptions
+from marl_sched.comms.options import DeployOptions, WorldOptions
 from marl_sched.comms.security.certificates import agent_names, make_certificates
 from marl_sched.comms.security.identity import Identity
 from marl_sched.errors import InvalidFileError, InvalidOptionError

@@ -114,14 +114,14 @@ def test_illegal_action_idles_the_agent_for_the_epoch(make_run):
 
     def run_agent(index: int) -> None:
         if index == 2:
-            from marl_sched.comms.agent import PolicyMind
+            from marl_sched.comms.mind import PolicyMind
 
             class Stubborn(PolicyMind):
                 def choose(self, noise: float) -> tuple[int, int | None]:
                     return 10**6, None
 
             from marl_sched.comms.agent import Agent
-            from marl_sched.comms.options import AgentOptions
+            from marl_sched.comms.agent_options import AgentOptions
 
             agent = Agent(AgentOptions(agent=2, policy="condition"), run.nodes[2])
             agent.mind = agent.protocol._mind = Stubborn(agent.options)

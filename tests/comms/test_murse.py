@@ -6,10 +6,10 @@ import pytest
 
 from marl_sched import murse_v0
 from marl_sched.agents.registry import create_scheduler
-from marl_sched.comms.agent import decider_of
 from marl_sched.comms.fork_server import warm_up
 from marl_sched.comms.inproc import play
 from marl_sched.comms.launcher import deploy
+from marl_sched.comms.mind import decider_of
 from marl_sched.comms.options import DeployOptions, WorldOptions
 from marl_sched.comms.replay import replay
 from marl_sched.domain import get_domain

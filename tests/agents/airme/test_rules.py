@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.stats import chisquare, weibull_min
 
+from marl_sched.agents.airme.light_rules import RandomRule
 from marl_sched.agents.airme.rules import (
     ModelBasedRule,
     PeriodicRule,
-    RandomRule,
     condition,
     corrective,
     corrective_as_published,

@@ -10,7 +10,7 @@ from marl_sched.agents.networks.compaction import compacted
 from marl_sched.agents.networks.hetgat.residual import ResidualHetGATNetwork
 from marl_sched.agents.policies.network_policy import NetworkPolicy
 from marl_sched.domain import get_domain
-from marl_sched.envs.airme.graph import graph_spec
+from marl_sched.envs.airme.features import graph_spec
 from marl_sched.envs.murse.graph import RANK, RULE_CHOICE
 from marl_sched.errors import InvalidOptionError
 from marl_sched.simulation import TurnSimulator
