@@ -24,14 +24,12 @@ import numpy as np
 from marl_sched.agents.base import EpochPlayer
 from marl_sched.agents.murse.following import PlanningScheduler
 from marl_sched.agents.murse.partial_schedule import PartialSchedule
-from marl_sched.agents.murse.problem import Plan, Round, plan_cost, timed
-from marl_sched.agents.murse.sampling import dispatched
+from marl_sched.agents.murse.problem import Plan, plan_cost
 from marl_sched.agents.murse.snapshot import as_murse, estimated_round
 from marl_sched.agents.murse.step_graph import PLACEHOLDERS, RoundFacts, StepGraphs
 from marl_sched.agents.murse.whole_rounds import round_player
 from marl_sched.agents.networks.planner import TrainedPlanner
 from marl_sched.agents.policies.cards import PolicyCard
-from marl_sched.envs.murse.instance import MurseInstance
 from marl_sched.envs.murse.simulator import MurseSimulator
 from marl_sched.envs.murse.state import NOBODY
 from marl_sched.errors import InvalidOptionError
@@ -45,7 +43,6 @@ ENSEMBLE = "ensemble"
 Worths = Callable[[dict[str, np.ndarray]], np.ndarray]
 """From the arrays of K graphs (marl_sched.agents.murse.step_graph) to worths of task nodes, float (K, tasks + 2)."""
 _EDGES_AT_ONCE = 1_500_000  # of a forward pass
-_PARTS = 3.0  # by which the reward of all steps but the last is divided (D in section 3.4.1)
 
 
 def pick_agent(schedule: PartialSchedule, strategy: Strategy, now: int) -> int:
@@ -110,7 +107,7 @@ def choices_at(schedule: PartialSchedule, strategy: Strategy) -> tuple[np.ndarra
 
 
 @dataclass(eq=False)
-class _Attempt:
+class Attempt:
     """One schedule under construction, and who chooses in it next."""
 
     number: int
@@ -134,15 +131,41 @@ class _Attempt:
     def _append(self, schedule: PartialSchedule, task: int) -> bool:
         return schedule.append(task, int(self.choices[task]), in_order=self.strategy != "active")
 
-    def take(self, worths: np.ndarray, look_ahead: bool) -> None:
-        """Take the task of the greatest worth, float (N,), among those offered, see the module's page."""
-        ranked = [task for task in np.argsort(-worths, kind="stable").tolist() if self.choices[task] >= 0]
+    def take(self, worths: np.ndarray, *, look_ahead: bool) -> None:
+        """Take the task of the greatest worth, float (N or more,), among those offered, see the module's page."""
+        ranked = [
+            task for task in np.argsort(-worths[: len(self.choices)], kind="stable").tolist() if self.choices[task] >= 0
+        ]
         for task in ranked if look_ahead else ():
             trial = self.schedule.copy()
             if self._append(trial, task):
                 self.schedule = trial
                 return
         self._append(self.schedule, ranked[0])
+
+
+def attempts_of(rounds: Sequence[RoundFacts], strategies: Sequence[Strategy]) -> list[Attempt]:
+    """An empty schedule for every round and strategy, in this order."""
+    starts = [PartialSchedule.of(facts.problem) for facts in rounds]
+    return [
+        Attempt(number, facts, strategy, starts[number].copy(), np.empty(0, np.int64))
+        for number, facts in enumerate(rounds)
+        for strategy in strategies
+    ]
+
+
+def build(
+    attempts: Sequence[Attempt], worths: Worths, chosen: Callable[[list[Attempt], StepGraphs, np.ndarray], None]
+) -> None:
+    """Build schedules in lock-step: `chosen(attempts, graphs, worths)` takes the next step of a block of them."""
+    going = [attempt for attempt in attempts if attempt.advance()]
+    while going:
+        for block in _blocks(going):
+            graphs = StepGraphs([attempt.facts for attempt in block], len(block))
+            for k, attempt in enumerate(block):
+                graphs.write(k, attempt.facts, attempt.schedule, attempt.choices, attempt.now)
+            chosen(block, graphs, worths(graphs.arrays)[:, PLACEHOLDERS:])
+        going = [attempt for attempt in going if attempt.advance()]
 
 
 def build_plans(
@@ -157,22 +180,13 @@ def build_plans(
 
     A plan that is not feasible has the tasks that were scheduled until the attempt had failed.
     """
-    attempts = [
-        _Attempt(number, facts, strategy, start.copy(), np.empty(0, np.int64))
-        for number, facts in enumerate(rounds)
-        for start in [PartialSchedule.of(facts.problem)]
-        for strategy in strategies
-    ]
-    going = [attempt for attempt in attempts if attempt.advance()]
-    while going:
-        for block in _blocks(going):
-            graphs = StepGraphs([attempt.facts for attempt in block], len(block))
-            for k, attempt in enumerate(block):
-                graphs.write(k, attempt.facts, attempt.schedule, attempt.choices, attempt.now)
-            found = worths(graphs.arrays)
-            for k, attempt in enumerate(block):
-                attempt.take(found[k, PLACEHOLDERS : PLACEHOLDERS + attempt.facts.problem.n_tasks], look_ahead)
-        going = [attempt for attempt in going if attempt.advance()]
+
+    def greedily(block: list[Attempt], graphs: StepGraphs, found: np.ndarray) -> None:
+        for attempt, values in zip(block, found, strict=True):
+            attempt.take(values, look_ahead=look_ahead)
+
+    attempts = attempts_of(rounds, strategies)
+    build(attempts, worths, greedily)
     best: list[Plan | None] = [None] * len(rounds)
     for attempt in attempts:
         plan, before = attempt.schedule.plan(), best[attempt.number]
@@ -182,10 +196,10 @@ def build_plans(
     return [plan for plan in best if plan is not None]
 
 
-def _blocks(attempts: list[_Attempt]) -> list[list[_Attempt]]:
+def _blocks(attempts: list[Attempt]) -> list[list[Attempt]]:
     """Attempts of about the same size, so many that their edges fit into one pass."""
     ordered = sorted(attempts, key=lambda attempt: attempt.facts.problem.n_tasks)
-    blocks: list[list[_Attempt]] = [[]]
+    blocks: list[list[Attempt]] = [[]]
     for attempt in ordered:
         edges = (attempt.facts.problem.n_tasks + PLACEHOLDERS) ** 2
         if blocks[-1] and edges * (len(blocks[-1]) + 1) > _EDGES_AT_ONCE:
@@ -248,73 +262,3 @@ class StepPlanner(PlanningScheduler, TrainedPlanner):
             return float(decisions), decisions
 
         return play
-
-
-def played_schedule(simulator: TurnSimulator, row: int) -> np.ndarray:
-    """Tasks, agents and starts of the first round that a row has played, int64 (3, N), by start, finish and agent.
-
-    N = 0 where that was not feasible.
-    """
-    murse = as_murse(simulator)
-    problem = Round.of(murse.instances[row])
-    plan = timed(problem, *dispatched(murse, row, 0))
-    if not plan.feasible:
-        return np.zeros((3, 0), np.int64)
-    starts, finishes = plan.starts[plan.tasks], plan.finishes[plan.tasks]
-    order = np.lexsort((plan.agents, finishes, starts))
-    return np.stack([plan.tasks[order], plan.agents[order], starts[order]])
-
-
-def steps_of(instance: MurseInstance, schedule: np.ndarray, discount: float) -> dict[str, np.ndarray]:
-    """The steps of a schedule, int64 (3, N) as `played_schedule` gives it, at which there was a choice.
-
-    Each step is taken once as the published strategies offer it, for the agent that the schedule has, and once as
-    `active` does, where that offers it. The arrays of their graphs with a leading axis K, `label` int64 (K,), the slot
-    of the task that it took, and `return` float64 (K,): the discounted rewards from there on in units of the horizon,
-    which add up to minus the makespan (section 3.4.1).
-    """
-    facts, graphs = RoundFacts.of(instance), StepGraphs([RoundFacts.of(instance)], 2 * schedule.shape[1])
-    picked, active, makespans = PartialSchedule.of(facts.problem), PartialSchedule.of(facts.problem), [0]
-    labels: list[int] = []
-    places: list[int] = []
-    for place, (task, agent, start) in enumerate(schedule.T.tolist()):
-        offers = (
-            (picked, np.where(picked.startable(start, agent), agent, -1), start),
-            (active, *choices_at(active, "active")),
-        )
-        for partial, choices, now in offers:
-            if (choices >= 0).sum() > 1 and _offers(facts.problem, choices, task, agent):
-                graphs.write(len(labels), facts, partial, choices, now)
-                labels.append(task + PLACEHOLDERS)
-                places.append(place)
-        picked.append(task, agent)
-        active.append(task, agent, in_order=False)
-        makespans.append(active.makespan)
-    rewards = -np.diff(makespans) / _PARTS
-    rewards[-1:] = -(makespans[-1] - makespans[-2] / _PARTS)
-    returns, ahead = np.zeros(len(rewards)), 0.0
-    for place in range(len(rewards) - 1, -1, -1):
-        ahead = returns[place] = rewards[place] / facts.horizon + discount * ahead
-    arrays = {name: array[: len(labels)] for name, array in graphs.arrays.items()}
-    return {**arrays, "label": np.array(labels, np.int64), "return": returns[places]}
-
-
-def _offers(problem: Round, choices: np.ndarray, task: int, agent: int) -> bool:
-    """Whether a task is among the choices for this agent, or for one that takes as long for it."""
-    other = int(choices[task])
-    return other >= 0 and bool(problem.durations[task, other] == problem.durations[task, agent])
-
-
-def gathered_steps(steps: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """The steps of several instances one behind the other, padded with zeros to the largest."""
-    out: dict[str, np.ndarray] = {}
-    for name, first in steps[0].items():
-        parts = [each[name] for each in steps]
-        shape = np.max([part.shape[1:] for part in parts], axis=0).astype(int) if first.ndim > 1 else ()
-        joined = np.zeros((sum(map(len, parts)), *shape), first.dtype)
-        at = 0
-        for part in parts:
-            joined[(slice(at, at + len(part)), *map(slice, part.shape[1:]))] = part
-            at += len(part)
-        out[name] = joined
-    return out

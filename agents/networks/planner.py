@@ -8,7 +8,7 @@ are those of every policy, and so are the commands that train, export, list and 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -68,3 +68,11 @@ class StepwiseNetwork(PlannerNetwork):
     @abstractmethod
     def gathered(self, steps: list[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
         """Steps of several instances as one batch, padded to the largest."""
+
+    @abstractmethod
+    def explored(self, instances: Sequence[Any], rng: np.random.Generator) -> dict[str, np.ndarray]:
+        """The steps with a choice that the network comes to when it plans instances itself, by sampling.
+
+        Arrays of its observation with a leading axis K, and `costs` float64 (K, n_actions), what a schedule costs that
+        a rule of the domain completes after each action; inf for actions that are not offered.
+        """

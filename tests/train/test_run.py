@@ -61,6 +61,15 @@ SELF_LABELLING = [
 ]  # fmt: skip
 
 
+DEMONSTRATIONS = [
+    "env=murse", "policy=schedulenet", "algorithm=demonstrations", "curriculum=rounds", "env.scales=[small,medium]",
+    "policy.width=2", "policy.heads=2", "policy.layers=2", "policy.hidden=4", "algorithm.instances=2",
+    "algorithm.problems=6", "algorithm.expert=lst", "algorithm.expert_options=null", "algorithm.criterion=values",
+    "algorithm.minibatch=16", "updates=4", "save_every=2", "validation.every=2", "validation.instances=2",
+    "validation.length=1",
+]  # fmt: skip
+
+
 class StoppedError(Exception):
     """Something from outside ends the run."""
 
@@ -99,6 +108,7 @@ def rows(directory: Path) -> list[dict[str, str]]:
         RANDOM_VIEW,
         SELF_LABELLING,
         GREEDY_ROLLOUT,
+        DEMONSTRATIONS,
         pytest.param(IMITATION, marks=pytest.mark.slow),
         pytest.param(ROLLOUT_IMITATION, marks=pytest.mark.slow),
     ],
@@ -110,6 +120,7 @@ def rows(directory: Path) -> list[dict[str, str]]:
         "random view",
         "self_labelling",
         "greedy_rollout",
+        "demonstrations",
         "imitation",
         "rollout_imitation",
     ],

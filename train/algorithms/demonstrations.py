@@ -55,7 +55,7 @@ class DemonstrationsConfig(SupervisedConfig, frozen=True, kw_only=True, tag_fiel
     instances: Count
     problems: Count
     expert: str
-    expert_options: dict[str, Any]
+    expert_options: dict[str, Any] | None
     criterion: Literal["ranking", "values"]
     discount: Share
     offset: NonNegative
@@ -64,46 +64,51 @@ class DemonstrationsConfig(SupervisedConfig, frozen=True, kw_only=True, tag_fiel
 
     def build(self, setup: Setup) -> tuple[Collector, Learner]:
         """See AlgorithmConfig; InvalidOptionError for a network that does not plan step by step."""
-        config = setup.config
-        if config.collector.name != "sync":
-            raise InvalidOptionError(
-                f"train: collector: demonstrations are made in this process: expected sync, got {config.collector.name}"
-            )
+        require_sync(setup)
         collector = ExpertCollector(self, setup)
-        network = setup.policy_for(collector.player(0))
-        if not isinstance(network, StepwiseNetwork):
-            raise InvalidOptionError(
-                f"train: policy: demonstrations are for networks that plan in steps, got {config.policy.network_name()}"
-            )
-        return collector, ValueImitation(network, self)
+        return collector, ValueImitation(stepwise(setup, collector.player(0)), self)
 
     def knowledge(self, config: TrainConfig) -> list[str]:
         """The expert's."""
-        expert = create_scheduler(self.expert, config.env.name, **self.expert_options)
+        expert = create_scheduler(self.expert, config.env.name, **(self.expert_options or {}))
         known = f" ({expert.privileged_info})" if expert.privileged_info else ""
         return [f"imitation of {expert.name}{known}"]
 
 
+def require_sync(setup: Setup) -> None:
+    """Raise InvalidOptionError for a collector that works elsewhere: planners' schedules are made in this process."""
+    config = setup.config
+    if config.collector.name != "sync":
+        name = config.algorithm.algorithm_name()
+        raise InvalidOptionError(f"train: collector: {name} plans here: expected sync, got {config.collector.name}")
+
+
+def stepwise(setup: Setup, simulator: Any) -> StepwiseNetwork:
+    """The run's freshly drawn network; InvalidOptionError for one that does not plan step by step."""
+    network = setup.policy_for(simulator)
+    if not isinstance(network, StepwiseNetwork):
+        name, got = setup.config.algorithm.algorithm_name(), setup.config.policy.network_name()
+        raise InvalidOptionError(f"train: policy: {name} is for networks that plan step by step, got {got}")
+    return network
+
+
 @dataclass(frozen=True, kw_only=True)
-class Demonstrations:
-    """What an expert did, as experience of an update.
+class Steps:
+    """Steps of schedules, as experience of an update.
 
     Attributes:
-        steps: batch (K,), what the network reads, with `label` and `return`.
+        steps: batch (K,), what the network reads, and what is learned of it.
+        reward_rate: what an instance brings.
         length: of an episode, in the domain's unit.
         time: episodes that were taken apart.
         seconds: wall time.
     """
 
     steps: TensorDict
+    reward_rate: float
     length: int
     time: int
     seconds: float
-
-    @property
-    def reward_rate(self) -> float:
-        """What the steps bring on average; nothing of it is simulated."""
-        return float(self.steps[RETURN].mean())
 
     @property
     def decisions(self) -> int:
@@ -124,7 +129,7 @@ class ExpertCollector:
     def __init__(self, config: DemonstrationsConfig, setup: Setup) -> None:
         self._config, self._scales = config, setup.config.env.scales
         self._problems = [setup.problem(scale, horizon=1) for scale in self._scales]
-        self._expert = create_scheduler(config.expert, setup.config.env.name, **config.expert_options)
+        self._expert = create_scheduler(config.expert, setup.config.env.name, **(config.expert_options or {}))
         self._schedules: dict[int, np.ndarray] = {}
         self._updates = 0
 
@@ -138,7 +143,7 @@ class ExpertCollector:
         block = number // self._config.instances
         return self._problems[block % len(self._scales)].simulator_of([self.instance(number)], pad=None)
 
-    def collect(self, policy: PolicyNetwork, length: int) -> Demonstrations:
+    def collect(self, policy: PolicyNetwork, length: int) -> Steps:
         """The steps of this update's instances."""
         assert isinstance(policy, StepwiseNetwork)  # build() made it
         begun, config = time.perf_counter(), self._config
@@ -160,7 +165,8 @@ class ExpertCollector:
         steps = TensorDict(
             {name: torch.from_numpy(array) for name, array in arrays.items()}, batch_size=len(arrays[LABEL])
         )
-        return Demonstrations(steps=steps, length=1, time=len(taken), seconds=time.perf_counter() - begun)
+        bring = float(arrays[RETURN].mean())
+        return Steps(steps=steps, reward_rate=bring, length=1, time=len(taken), seconds=time.perf_counter() - begun)
 
     def state(self) -> dict[str, np.ndarray]:
         """The number of updates and every schedule that was made, one behind the other."""
@@ -197,7 +203,7 @@ class ValueImitation:
         self.modules: dict[str, nn.Module] = {"policy": policy}
         self.optimizer = torch.optim.Adam(policy.parameters(), weight_decay=config.weight_decay, fused=True)
 
-    def learn(self, rollout: Demonstrations, progress: float, rng: np.random.Generator) -> dict[str, float]:
+    def learn(self, rollout: Steps, progress: float, rng: np.random.Generator) -> dict[str, float]:
         """Go over the steps; the loss, how often the expert's choice is the best, and the gradient's norm."""
         config, device = self._config, device_of(self.policy)
         for group in self.optimizer.param_groups:

@@ -63,10 +63,11 @@ def _head(plan: Comparisons, command: str, *, quick: bool) -> Iterator[str]:
         f"**Feasible** is the share of rounds, **{plan.objective}** the mean over rounds, an infeasible one being "
         "charged the domain's worst case. *In italics*, behind: what the dissertation published "
         f"({plan.source}), on other instances of the same distribution. **Over** is the mean ratio to the row that "
-        f"stands for the optimum, over rounds feasible for both. **Difference** is in {plan.objective}, in percent of "
-        "the baseline's mean, paired by instance, with the 95 percent interval for such instances; a row of fewer "
-        "instances is held against the same ones of the baseline. **CPU** is processor time for a round, simulation "
-        "included, many instances in one batch where the scheduler can."
+        "stands for the optimum, over rounds feasible for both. **Within r** is the percentage of rounds solved with "
+        "at most r times that row's objective, any solution counting where that row has none. **Difference** is in "
+        f"{plan.objective}, in percent of the baseline's mean, paired by instance, with the 95 percent interval for "
+        "such instances; a row of fewer instances is held against the same ones of the baseline. **CPU** is processor "
+        "time for a round, simulation included, many instances in one batch where the scheduler can."
     )
     if plan.note:
         yield plan.note.strip()
@@ -77,6 +78,7 @@ def _scale_table(of: _Scale) -> str:
     heads = ["scheduler", "feasible %", of.objective, f"difference to {table.baseline} %", "CPU ms"]
     if table.exact is not None:
         heads.insert(3, f"over {table.exact}")
+    heads[4:4] = [f"within {ratio:g}" for ratio in table.within]
     if table.view["kind"] != "full":
         heads.append("sees %")
     lines = [_line(of, row, heads) for row in table.rows if row.label in of.cells or of.scale in row.published]
@@ -87,9 +89,9 @@ def _scale_table(of: _Scale) -> str:
 def _line(of: _Scale, row: Entry, heads: Sequence[str]) -> list[str]:
     """A row's figures on a scale."""
     cell, published = of.cells.get(row.label), row.published.get(of.scale)
-    told = ["", ""] if published is None else [f"*{published.feasible:g}*", f"*{published.objective:g}*"]
+    told = [""] * 2 if published is None else [_published(published.feasible), _published(published.objective)]
     if cell is None:
-        return [row.label, *told, *[_NONE] * (len(heads) - 3)]
+        return [row.label, *(one or _NONE for one in told), *[_NONE] * (len(heads) - 3)]
     fewer = "" if len(cell.objective) == _most(of) else f" ({len(cell.objective)} instances)"
     figures = [
         f"{row.label}{fewer}",
@@ -97,7 +99,9 @@ def _line(of: _Scale, row: Entry, heads: Sequence[str]) -> list[str]:
         f"{np.mean(np.concatenate(cell.objective)):.1f} {told[1]}".strip(),
     ]
     if of.table.exact is not None:
-        figures.append(_ratio(cell, of.first(of.table.exact, 1)))
+        exact = of.first(of.table.exact, 1)
+        figures.append(_ratio(cell, exact))
+        figures += [_NONE if exact is None else f"{100 * solved_within(cell, exact, r):.0f}" for r in of.table.within]
     figures.append(_difference(cell, of.first(of.table.baseline, len(cell.objective))))
     rounds = sum(len(one) for one in cell.objective)
     figures.append(f"{1000 * cell.cpu_seconds / rounds:.3g}")
@@ -123,6 +127,25 @@ def _ratio(cell: Cell, exact: Cell | None) -> str:
         if all(good)
     ]
     return f"{np.mean(ratios):.3f}" if ratios else _NONE
+
+
+def solved_within(cell: Cell, exact: Cell, ratio: float) -> float:
+    """The share of rounds that are feasible with an objective of at most `ratio` times the exact one's (section 4.4.3).
+
+    Of the instances that both have played. Where the exact row found nothing, any feasible round counts.
+    """
+    solved = [
+        bool(good) and (not known or ours <= ratio * theirs)
+        for i in range(min(len(cell.objective), len(exact.objective)))
+        for ours, theirs, good, known in zip(
+            cell.objective[i], exact.objective[i], cell.feasible[i], exact.feasible[i], strict=True
+        )
+    ]
+    return float(np.mean(solved))
+
+
+def _published(value: float | None) -> str:
+    return "" if value is None else f"*{value:g}*"
 
 
 def _difference(cell: Cell, baseline: Cell | None) -> str:

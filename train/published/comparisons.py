@@ -40,10 +40,10 @@ class _Part(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class Published(Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """A published entry: share of feasible rounds in percent, and the objective."""
+    """A published entry: share of feasible rounds in percent, and the objective where that was told."""
 
     feasible: float
-    objective: float
+    objective: float | None = None
 
 
 class Entry(_Part, frozen=True, kw_only=True):
@@ -79,6 +79,7 @@ class Comparison(_Part, frozen=True, kw_only=True):
         instances: scale -> number of instances.
         baseline: label of the row that the others are held against.
         exact: label of the row that stands for the optimum; None: none does.
+        within: ratios to that row; the table has the share of all rounds that were solved within each.
         rows: in the order of the table.
     """
 
@@ -90,6 +91,7 @@ class Comparison(_Part, frozen=True, kw_only=True):
     instances: Annotated[dict[str, Count], Meta(min_length=1)]
     baseline: str
     exact: str | None = None
+    within: list[Annotated[float, Meta(ge=1)]] = []
     rows: Annotated[list[Entry], Meta(min_length=1)]
 
 
@@ -208,6 +210,8 @@ def _check(plan: Comparisons) -> None:
         labels = [row.label for row in table.rows]
         if len(set(labels)) < len(labels):
             raise InvalidOptionError(f"rows of {table.title!r}: expected distinct labels")
+        if table.within and table.exact is None:
+            raise InvalidOptionError(f"{table.title!r}: within: expected a row that stands for the optimum: exact")
         for label in (table.baseline, *([table.exact] if table.exact is not None else [])):
             require(f"row of {table.title!r}", label, labels)
         for scale in table.instances:

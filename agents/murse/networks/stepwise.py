@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import numpy as np
 import torch
 
 from marl_sched.agents.murse.step_graph import SPEC
-from marl_sched.agents.murse.step_planner import StepPlanner, gathered_steps, played_schedule, steps_of
+from marl_sched.agents.murse.step_learning import explored_steps, gathered_steps, played_schedule, steps_of
+from marl_sched.agents.murse.step_planner import StepPlanner, Worths
 from marl_sched.agents.networks.planner import StepwiseNetwork
 from marl_sched.agents.policies.cards import PolicyCard
 from marl_sched.errors import InvalidOptionError
@@ -60,15 +61,24 @@ class MurseStepNetwork(StepwiseNetwork):
         """See StepwiseNetwork."""
         return gathered_steps([dict(each) for each in steps])
 
+    def explored(self, instances: Sequence[Any], rng: np.random.Generator) -> dict[str, np.ndarray]:
+        """See StepwiseNetwork."""
+        found = explored_steps(instances, self._worths(), rng)
+        return {name: array for name, array in found.items() if name in _READ or name == "costs"}
+
     def planner(self, name: str, card: PolicyCard | None, **options: Any) -> StepPlanner:
         """What plays a copy of the network on the CPU; options are StepPlanner's."""
         network = copy.deepcopy(self).cpu().requires_grad_(False)
-        with torch.inference_mode():
-            weights = network.weights()
+        return StepPlanner(network._worths(), name, card, **options)
+
+    @torch.inference_mode()
+    def _worths(self) -> Worths:
+        """The network on arrays, with its present parameters."""
+        weights, device = self.weights(), next(self.parameters()).device
 
         @torch.inference_mode()
         def worths(arrays: dict[str, np.ndarray]) -> np.ndarray:
-            tensors = {name: torch.from_numpy(array) for name, array in arrays.items() if name in _READ}
-            return cast(np.ndarray, network(tensors, weights).numpy())
+            tensors = {name: torch.from_numpy(array).to(device) for name, array in arrays.items() if name in _READ}
+            return cast(np.ndarray, self(tensors, weights).cpu().numpy())
 
-        return StepPlanner(worths, name, card, **options)
+        return worths

@@ -13,15 +13,8 @@ from marl_sched.agents.murse.networks.robognn import EdgeAttention
 from marl_sched.agents.murse.partial_schedule import PartialSchedule
 from marl_sched.agents.murse.problem import Round
 from marl_sched.agents.murse.step_graph import PLACEHOLDERS, SPEC, TASK, RoundFacts, StepGraphs
-from marl_sched.agents.murse.step_planner import (
-    PUBLISHED,
-    Strategy,
-    build_plans,
-    choices_at,
-    gathered_steps,
-    pick_agent,
-    steps_of,
-)
+from marl_sched.agents.murse.step_learning import gathered_steps, step_costs, steps_of
+from marl_sched.agents.murse.step_planner import PUBLISHED, Strategy, attempts_of, build_plans, choices_at, pick_agent
 from marl_sched.agents.networks.planner import StepwiseNetwork
 from marl_sched.agents.networks.registry import network_config
 from marl_sched.domain import get_domain
@@ -221,3 +214,20 @@ def test_returns_of_a_schedule_add_up_to_its_makespan():
     # After the first task the makespan is 4, of which a third was paid.
     second = [value for value, label in zip(steps["return"], steps["label"], strict=True) if label == 1 + PLACEHOLDERS]
     assert second[0] == pytest.approx(-(5 - 4 / 3) / 4.5)
+
+
+def test_costs_of_choices_are_those_of_the_schedules_that_follow():
+    # One robot, tasks of 4 and 3, the second due by 5. Taken first it ends at 3 and the other at 7; taken second it
+    # ends at 7, two late: makespan 7, half of it for lateness, 2 for each unit, and a twentieth of the mean finish.
+    instance = problem([[4], [3]], deadlines=[-1, 5])
+    (attempt,) = attempts_of([RoundFacts.of(instance)], ["active"])
+    assert attempt.advance()
+    late_first, in_time = 7 * 1.5 + 2 * 2 + 0.05 * (4 + 7) / 2, 7 + 0.05 * (3 + 7) / 2
+    assert step_costs(attempt) == pytest.approx([late_first, in_time])
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_explored_steps_have_a_cost_for_every_task_that_is_offered(name):
+    steps = network(name).explored(instances(count=2), np.random.default_rng(0))
+    assert len(steps["costs"]) == len(steps[ACTION_MASK]) > 10
+    np.testing.assert_array_equal(np.isfinite(steps["costs"]), steps[ACTION_MASK] != 0)

@@ -79,6 +79,19 @@ def test_the_pages_figures_by_hand(plan):
     assert "`0123456789ab` (2)" in told
 
 
+def test_share_solved_within_a_ratio_counts_what_the_exact_row_did_not_find():
+    """lst is at 100 / 80 = 1.25 in the first round and alone in the second; the others of lst edf has not played."""
+    given = deepcopy(TINY)
+    given["comparisons"][0] |= {"within": [1.2, 1.25]}
+    given["comparisons"][0]["rows"][0]["published"] = {"small": [61.5]}
+    plan = as_comparisons(given, "tiny")
+    told = page(plan, cells(plan), COMMAND)
+    assert "| scheduler | feasible % | makespan | over edf | within 1.2 | within 1.25 | difference to lst % |" in told
+    assert "| lst | 75.0 | 250.0 | 1.250 | 50 | 100 | - | 5 |" in told
+    assert "| 1.000 | 50 | 50 | -10.0" in told
+    assert "| published | *61.5* | - | - | - | - | - | - |" in told
+
+
 def test_missing_cells_are_named_with_the_command_and_made(plan, tmp_path: Path):
     with pytest.raises(MarlSchedError, match="2 cells are missing, lst on small of 'Planned' among them: `marl-sched"):
         page(plan, {}, COMMAND)
@@ -101,6 +114,7 @@ def test_missing_cells_are_named_with_the_command_and_made(plan, tmp_path: Path)
         ({"instances": {"tiny": 2}}, "tiny"),
         ({"options": {"speed": 2}}, "speed"),
         ({"surplus": 1}, "surplus"),
+        ({"exact": None, "within": [1.1]}, "within"),
     ],
 )
 def test_a_list_that_is_wrong_is_refused(change, message):
