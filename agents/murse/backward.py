@@ -10,9 +10,37 @@ from __future__ import annotations
 
 import numpy as np
 
+from marl_sched.agents.murse import latest_start as lst
+from marl_sched.agents.murse.problem import Round
 from marl_sched.kernels import kernel
 
 _FAR = 1e18
+_LATE = 2.0  # by when tasks that no deadline presses have to end, in the larger of common horizon and latest deadline
+
+
+def latest_finishes(problem: Round) -> tuple[np.ndarray, np.ndarray]:
+    """The latest finish of each task by deadlines and waits alone, float64 (N,), and whether a deadline presses it.
+
+    Tasks with no deadline at or behind them have to end so late that nobody has to hurry for them.
+    """
+    late = _LATE * max(lst.common_horizon(problem.durations), float(problem.deadlines.max()))
+    none = np.full(problem.n_tasks, -1, np.int64)
+    starts = lst.latest_starts(problem.durations, problem.lags, problem.deadlines, late)
+    unpressed = lst.latest_starts(problem.durations, problem.lags, none, late)
+    return starts + lst.shortest_durations(problem.durations), starts < unpressed
+
+
+def backward_keys(problem: Round) -> np.ndarray:
+    """`backward_starts` of what is open in a round, float64 (N,)."""
+    found: np.ndarray = backward_starts(
+        problem.durations,
+        lst.successors(problem.lags),
+        problem.lags,
+        problem.near,
+        problem.fixed < 0,
+        latest_finishes(problem)[0],
+    )
+    return found
 
 
 @kernel

@@ -1,4 +1,4 @@
-"""The schedulers `lst`, `lst-robust` and `lst-search`: least latest start first, see `latest_start`."""
+"""The schedulers `lst`, `lst-robust`, `lst-backward` and `lst-search`: least latest start first, see `latest_start`."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from marl_sched.agents.murse import latest_start as kernels
+from marl_sched.agents.murse.backward import backward_keys
 from marl_sched.agents.murse.following import PlanningScheduler
 from marl_sched.agents.murse.problem import Plan, Round
 from marl_sched.agents.murse.snapshot import as_expected, estimated_round, remaining_round
@@ -165,6 +166,16 @@ class RobustLst(LeastLatestStart):
 
     def __init__(self, margin: float = MARGIN) -> None:
         super().__init__(margin)
+
+
+class BackwardLst(LeastLatestStart):
+    """Latest starts that count agents and places (`backward`), generated forwards as `lst` generates its own."""
+
+    name = "lst-backward"
+
+    def scheduled(self, simulator: MurseSimulator, env_index: int, problem: Round) -> Plan:
+        """The schedule by these keys."""
+        return keyed_plan(problem, backward_keys(problem))
 
 
 class LstSearch(LeastLatestStart):

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from marl_sched.agents.base import Scheduler
 from marl_sched.agents.murse.dispatching import factories
 from marl_sched.agents.murse.genetic import GeneticEdf
-from marl_sched.agents.murse.lst import LeastLatestStart, LstSearch, RobustLst
+from marl_sched.agents.murse.lst import BackwardLst, LeastLatestStart, LstSearch, RobustLst
 from marl_sched.agents.murse.negotiated import Cbba, Tessi, TessiSlack
 from marl_sched.agents.murse.optimal import ExactScheduler, RollingScheduler, is_feasible, solver_bound
 from marl_sched.agents.murse.published import EdfPublished, GeneticPublished
@@ -26,6 +26,7 @@ RULES: dict[str, Callable[..., Scheduler]] = {
     **factories(),
     "lst": LeastLatestStart,
     "lst-robust": RobustLst,
+    "lst-backward": BackwardLst,
     "lst-search": LstSearch,
     "first-claim": FirstClaim,
     "tessi": Tessi,

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from marl_sched.agents.murse import latest_start as lst
-from marl_sched.agents.murse.backward import backward_starts
+from marl_sched.agents.murse.backward import backward_starts, latest_finishes
 from marl_sched.agents.murse.partial_schedule import PartialSchedule
 from marl_sched.agents.murse.problem import Round
 from marl_sched.envs.murse.instance import MurseInstance
@@ -107,10 +107,7 @@ class RoundFacts:
         positions, places = np.unique(instance.locations, axis=0, return_inverse=True)
         apart = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
         reach = {"distance": instance.safety_distance, "location": 0.0, "none": -1.0}[instance.proximity]
-        shortest = lst.shortest_durations(problem.durations)
-        late = 2.0 * max(horizon, lst.common_horizon(problem.durations))
-        unpressed = lst.latest_starts(problem.durations, problem.lags, np.full(problem.n_tasks, -1), late)
-        starts = lst.latest_starts(problem.durations, problem.lags, problem.deadlines, late)
+        ends, dated = latest_finishes(problem)
         rule = lst.common_horizon(problem.durations)
         return cls(
             problem=problem,
@@ -119,10 +116,10 @@ class RoundFacts:
             horizon=horizon,
             unit=float(max(means.mean(), 1.0)),
             rule_starts=lst.latest_starts(problem.durations, problem.lags, problem.deadlines, rule),
-            ends=starts + shortest,
-            dated=starts < unpressed,
+            ends=ends,
+            dated=dated,
             waiting=lst.successors(problem.lags),
-            shortest=shortest,
+            shortest=lst.shortest_durations(problem.durations),
         )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import given, settings
 
+from marl_sched.agents.murse.backward import backward_keys
 from marl_sched.agents.murse.latest_start import (
     MAKESPAN,
     WEIGHTED,
@@ -17,7 +18,7 @@ from marl_sched.agents.murse.latest_start import (
 )
 from marl_sched.agents.murse.problem import Round, timed
 from marl_sched.envs.murse.instance import INELIGIBLE, NO_DEADLINE
-from tests.murse.problems import instances
+from tests.murse.problems import instances, problem
 
 
 def by_the_text(whole: Round, keys: np.ndarray) -> tuple[list[int], list[int]]:
@@ -120,3 +121,15 @@ def test_lateness_comes_before_the_objective():
     ends, deadlines, weights = np.array([5, 9]), np.array([4, NO_DEADLINE]), np.array([2.0, 1.0])
     assert cost(ends, deadlines, weights, MAKESPAN) == (1, 9.0)
     assert cost(ends, deadlines, weights, WEIGHTED) == (1, 19.0)
+
+
+def test_backward_starts_leave_room_for_all_who_need_a_place_or_an_agent():
+    # Tasks 1 and 2 share a place and are due by 10; task 3 has to wait 2 after task 2 and is due by 20. From the end:
+    # task 3 starts at 20 - 6, so task 2 has to end by 12, and by 10; ties of 1 and 2 go to 1, which starts at 5.
+    robots = [[5, 5], [4, 4], [6, 6]]
+    places = [[0, 0], [0, 0], [9, 9]]
+    apart = problem(robots, deadlines=[10, 10, 20], waits=[(2, 1, 2)], locations=places)
+    assert backward_keys(Round.of(apart)).tolist() == [5, 1, 14]
+    # One robot alone has to do all three: task 3 from 14, then as before.
+    alone = problem([row[:1] for row in robots], deadlines=[10, 10, 8], locations=[[0, 0], [9, 0], [0, 9]])
+    assert backward_keys(Round.of(alone)).tolist() == [5, 1, -5]
