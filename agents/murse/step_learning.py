@@ -12,8 +12,8 @@ from marl_sched.agents.murse.partial_schedule import PartialSchedule
 from marl_sched.agents.murse.problem import Round, timed
 from marl_sched.agents.murse.sampling import dispatched
 from marl_sched.agents.murse.snapshot import as_murse
-from marl_sched.agents.murse.step_graph import PLACEHOLDERS, RoundFacts, StepGraphs
-from marl_sched.agents.murse.step_planner import PUBLISHED, Attempt, Strategy, Worths, attempts_of, build, choices_at
+from marl_sched.agents.murse.step_graph import PLACEHOLDERS, TASK, RoundFacts, StepGraphs
+from marl_sched.agents.murse.step_planner import PUBLISHED, Attempt, Worths, attempts_of, build, choices_at
 from marl_sched.envs.murse.instance import NO_DEADLINE, MurseInstance
 from marl_sched.kernels import kernel
 from marl_sched.simulation import TurnSimulator
@@ -21,6 +21,9 @@ from marl_sched.simulation import TurnSimulator
 LATE_CHARGE = 2.0  # of a unit of lateness, in units of makespan
 INFEASIBLE_CHARGE = 0.5  # of any lateness at all, as a share of the makespan
 COMPACT_CHARGE = 0.05  # of the mean finish of tasks: what tells schedules of the same makespan apart
+RULE_CHARGE = 0.01  # of the last candidate by the rule, as a share of the cost: what tells equal costs apart
+NOISE = 0.5
+PUBLISHED_EVERY = 4  # instances
 _PARTS = 3.0  # by which the reward of all steps but the last is divided (D in section 3.4.1)
 
 
@@ -165,26 +168,26 @@ def step_costs(attempt: Attempt) -> np.ndarray:
 def explored_steps(
     instances: Sequence[MurseInstance], worths: Worths, rng: np.random.Generator
 ) -> dict[str, np.ndarray]:
-    """The steps with a choice of schedules that a network samples, every instance once by `active` and once published.
+    """The steps with a choice of schedules that a network samples: of every instance by `active`, of some as published.
 
-    The arrays of their graphs with a leading axis K, and `costs` float64 (K, N + 2): see `step_costs`. The probability
-    of a task is the softmax of worths; one after which the network is inconsistent is passed over for another.
+    The arrays of their graphs with a leading axis K, and `costs` float64 (K, N + 2): see `step_costs`, plus RULE_CHARGE
+    for the rank by `backward_starts`. Tasks are drawn by Gumbel noise of NOISE on their worths; one after which the
+    network is inconsistent is passed over for the next.
     """
     rounds = [RoundFacts.of(instance) for instance in instances]
-    strategies: list[Strategy] = [PUBLISHED[int(pick)] for pick in rng.integers(len(PUBLISHED), size=len(rounds))]
-    attempts = [
-        attempt
-        for facts, strategy in zip(rounds, strategies, strict=True)
-        for attempt in attempts_of([facts], ("active", strategy))
-    ]
+    attempts = attempts_of(rounds, ("active",))
+    for facts in rounds[::PUBLISHED_EVERY]:
+        attempts += attempts_of([facts], (PUBLISHED[int(rng.integers(len(PUBLISHED)))],))
     steps: list[dict[str, np.ndarray]] = []
 
     def sampled(block: list[Attempt], graphs: StepGraphs, found: np.ndarray) -> None:
         costs = np.full((len(block), found.shape[1] + PLACEHOLDERS), np.inf)
         for k, attempt in enumerate(block):
             costs[k, PLACEHOLDERS : PLACEHOLDERS + attempt.facts.problem.n_tasks] = step_costs(attempt)
+        ranks = graphs.arrays["task"][..., TASK.index("candidate_rank")]
+        costs += RULE_CHARGE * costs.min(axis=1, keepdims=True) * ranks
         steps.append({**graphs.arrays, "costs": costs})
-        noise = rng.gumbel(size=found.shape)  # whose addition makes the greatest a sample of the softmax
+        noise = NOISE * rng.gumbel(size=found.shape)
         for attempt, values in zip(block, found + noise, strict=True):
             attempt.take(values, look_ahead=True)
 

@@ -10,8 +10,8 @@ the state's embedding and the task's node under the robot's features (Q network 
 many robots or tasks there are. HomGNN of chapter 4 is the same network, one for each size of team.
 
 Not as published: fewer parameters, the features of marl_sched.agents.murse.step_graph instead of duration and a one-hot
-location (edges say what is near), a transform of a node's own features beside its messages, and the task's features
-once more in the Q network.
+location (edges say what is near), a transform of a node's own features beside its messages, the task's features once
+more in the Q network, and a rule that it corrects.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from torch.nn import functional
 
 from marl_sched.agents.murse.networks.stepwise import MurseStepNetwork, StepGraphConfig
 from marl_sched.agents.murse.step_graph import TASK, TEMPORAL
-from marl_sched.agents.networks.network import explore_at_first, fully_connected, mask_logits
+from marl_sched.agents.networks.network import explore_at_first, fully_connected
 from marl_sched.agents.networks.registry import NAME, NetworkConfig
 from marl_sched.agents.policies.cards import Heads, Layers, Width
 from marl_sched.graph import GraphSpec
@@ -139,7 +139,7 @@ class RoboGNN(MurseStepNetwork):
         decider = observation["decider"].clamp(min=0)  # (K, n)
         action = nodes.gather(1, decider[:, None, :, None].expand(-1, 1, -1, nodes.shape[-1])).squeeze(1)
         values = torch.cat([state[:, None].expand_as(action), action, tasks], dim=-1)
-        return mask_logits(self.q(values).squeeze(-1), observation)
+        return self.corrected(self.q(values).squeeze(-1), observation)
 
 
 def _owners(tasks: Tensor, own: Tensor) -> Tensor:

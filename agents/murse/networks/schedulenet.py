@@ -2,22 +2,23 @@
 
 Layers are those of marl_sched.agents.networks.hetgat (equations 4.3 to 4.14), whose target side of the attention is
 every type's own transform. Not as published: far fewer parameters, the features of marl_sched.agents.murse.step_graph,
-and a small head that reads a value node beside its task's features; the published worth is the value node's output.
+a small head that reads a value node beside its task's features, where the published worth is the value node's output,
+and a rule that it corrects.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, cast
+from typing import Annotated
 
 import torch
 from msgspec import Meta, Struct
-from torch import Tensor, nn
+from torch import Tensor
 
 from marl_sched.agents.murse.networks.stepwise import MurseStepNetwork, StepGraphConfig
 from marl_sched.agents.murse.step_graph import TASK
 from marl_sched.agents.networks.hetgat.network import EncoderWeights, HetGATEncoder
-from marl_sched.agents.networks.network import explore_at_first, fully_connected, mask_logits
+from marl_sched.agents.networks.network import explore_at_first, fully_connected
 from marl_sched.agents.networks.registry import NAME, NetworkConfig
 from marl_sched.agents.policies.cards import Heads, Layers, Width
 from marl_sched.graph import DECISION, GraphSpec
@@ -70,4 +71,4 @@ class ScheduleNet(MurseStepNetwork):
         """Worths (K, N + 2), the lowest finite number outside the action mask."""
         nodes, graph = self.encoder(observation, weights)
         values = torch.cat([nodes[DECISION], graph.nodes["task"]], dim=-1)
-        return mask_logits(cast(nn.Module, self.head)(values).squeeze(-1), observation)
+        return self.corrected(self.head(values).squeeze(-1), observation)

@@ -8,16 +8,19 @@ from typing import Any, cast
 
 import numpy as np
 import torch
+from torch import Tensor, nn
 
-from marl_sched.agents.murse.step_graph import SPEC
+from marl_sched.agents.murse.step_graph import SPEC, TASK
 from marl_sched.agents.murse.step_learning import explored_steps, gathered_steps, played_schedule, steps_of
 from marl_sched.agents.murse.step_planner import StepPlanner, Worths
+from marl_sched.agents.networks.network import mask_logits
 from marl_sched.agents.networks.planner import StepwiseNetwork
 from marl_sched.agents.policies.cards import PolicyCard
 from marl_sched.errors import InvalidOptionError
 from marl_sched.graph import GraphSpec
 from marl_sched.simulation import TurnSimulator
 
+RULE_WEIGHT = 8.0  # at first, of a candidate's rank, from 0 for the first to nearly 1 for the last
 _READ = frozenset(SPEC.arrays(dict.fromkeys(("task", "agent", "place"), 1))) - {"time", "visible_share"}
 
 
@@ -34,6 +37,8 @@ class StepGraphConfig:
 class MurseStepNetwork(StepwiseNetwork):
     """A network that gives the tasks which an agent can start their worths.
 
+    It corrects a rule: an untrained one chooses the task that has to start first by `backward_starts`, nearly always.
+
     Args:
         spec: the metagraph.
 
@@ -47,6 +52,12 @@ class MurseStepNetwork(StepwiseNetwork):
         if spec != SPEC:
             raise InvalidOptionError("graph: expected that of marl_sched.agents.murse.step_graph in this version")
         self.spec = spec
+        self.rule_weight = nn.Parameter(torch.tensor(RULE_WEIGHT))
+
+    def corrected(self, values: Tensor, observation: Mapping[str, Tensor]) -> Tensor:
+        """Worths (K, N + 2) from the network's corrections; the lowest finite number outside the action mask."""
+        ranks = observation["task"][..., TASK.index("candidate_rank")].to(values.dtype)
+        return mask_logits(values - self.rule_weight * ranks, observation)
 
     def demonstration(self, simulator: TurnSimulator, row: int) -> np.ndarray:
         """See StepwiseNetwork."""
