@@ -20,6 +20,7 @@ from marl_sched.simulation import TurnSimulator
 
 LATE_CHARGE = 2.0  # of a unit of lateness, in units of makespan
 INFEASIBLE_CHARGE = 0.5  # of any lateness at all, as a share of the makespan
+TIGHT_CHARGE = 0.1  # of a unit by which a task ends less than the mean duration before its deadline
 COMPACT_CHARGE = 0.05  # of the mean finish of tasks: what tells schedules of the same makespan apart
 RULE_CHARGE = 0.01  # of the last candidate by the rule, as a share of the cost: what tells equal costs apart
 NOISE = 0.5
@@ -105,6 +106,7 @@ def completion_costs(
     waiting: tuple[np.ndarray, np.ndarray, np.ndarray],
     near: np.ndarray,
     deadlines: np.ndarray,
+    unit: float,
     order: np.ndarray,
     count: int,
     doers: np.ndarray,
@@ -120,7 +122,8 @@ def completion_costs(
     The first `count` of `order` int64 (N,) are dispatched (see `latest_start.complete`, as for the other arrays);
     earliest int64 (N,) are earliest starts; choices int64 (N,) the agents of tasks that may come next, -1 for others,
     which cost inf; keys float64 (L, N), of which the best counts. A cost is the makespan, plus LATE_CHARGE of the sum
-    of lateness, INFEASIBLE_CHARGE of the makespan if anything is late, and COMPACT_CHARGE of the mean finish.
+    of lateness, INFEASIBLE_CHARGE of the makespan if anything is late, TIGHT_CHARGE of what lacks for every task to end
+    `unit` before its deadline, and COMPACT_CHARGE of the mean finish.
     """
     n = len(choices)
     costs = np.full(n, np.inf)
@@ -134,13 +137,14 @@ def completion_costs(
             end[task] = begin[task] + durations[task, agent]
             then[count], who[task], ready[agent] = task, agent, end[task]
             complete(durations, waiting, near, keys[way], ready, then, count + 1, who, begin, end)
-            late = 0
+            late, tight = 0, 0.0
             for other in range(n):
                 if deadlines[other] != NO_DEADLINE:
                     late += max(end[other] - deadlines[other], 0)
+                    tight += max(end[other] + unit - deadlines[other], 0.0)
             last = end.max()
             cost = last * (1.0 + (INFEASIBLE_CHARGE if late > 0 else 0.0)) + LATE_CHARGE * late
-            costs[task] = min(costs[task], cost + COMPACT_CHARGE * end.mean())
+            costs[task] = min(costs[task], cost + TIGHT_CHARGE * tight + COMPACT_CHARGE * end.mean())
     return costs
 
 
@@ -159,7 +163,7 @@ def step_costs(attempt: Attempt) -> np.ndarray:
         problem.durations, facts.waiting, problem.lags, problem.near, schedule.still_open, facts.ends
     )
     costs: np.ndarray = completion_costs(
-        problem.durations, facts.waiting, problem.near, problem.deadlines, order, len(done), schedule.doers, start,
+        problem.durations, facts.waiting, problem.near, problem.deadlines, facts.unit, order, len(done), schedule.doers, start,
         finish, schedule.free_at, start, attempt.choices, np.stack([backward, facts.rule_starts]),
     )  # fmt: skip
     return costs

@@ -218,11 +218,12 @@ def test_returns_of_a_schedule_add_up_to_its_makespan():
 
 def test_costs_of_choices_are_those_of_the_schedules_that_follow():
     # One robot, tasks of 4 and 3, the second due by 5. Taken first it ends at 3 and the other at 7; taken second it
-    # ends at 7, two late: makespan 7, half of it for lateness, 2 for each unit, and a twentieth of the mean finish.
+    # ends at 7, two late: makespan 7, half of it for lateness, 2 for each unit, a tenth of what lacks to the mean
+    # duration of 3.5 before the deadline, and a twentieth of the mean finish.
     instance = problem([[4], [3]], deadlines=[-1, 5])
     (attempt,) = attempts_of([RoundFacts.of(instance)], ["active"])
     assert attempt.advance()
-    late_first, in_time = 7 * 1.5 + 2 * 2 + 0.05 * (4 + 7) / 2, 7 + 0.05 * (3 + 7) / 2
+    late_first, in_time = 7 * 1.5 + 2 * 2 + 0.1 * 5.5 + 0.05 * (4 + 7) / 2, 7 + 0.1 * 1.5 + 0.05 * (3 + 7) / 2
     assert step_costs(attempt) == pytest.approx([late_first, in_time])
 
 
