@@ -163,8 +163,8 @@ def step_costs(attempt: Attempt) -> np.ndarray:
         problem.durations, facts.waiting, problem.lags, problem.near, schedule.still_open, facts.ends
     )
     costs: np.ndarray = completion_costs(
-        problem.durations, facts.waiting, problem.near, problem.deadlines, facts.unit, order, len(done), schedule.doers, start,
-        finish, schedule.free_at, start, attempt.choices, np.stack([backward, facts.rule_starts]),
+        problem.durations, facts.waiting, problem.near, problem.deadlines, facts.unit, order, len(done),
+        schedule.doers, start, finish, schedule.free_at, start, attempt.choices, np.stack([backward, facts.rule_starts]),
     )  # fmt: skip
     return costs
 
