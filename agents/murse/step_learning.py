@@ -164,7 +164,8 @@ def step_costs(attempt: Attempt) -> np.ndarray:
     )
     costs: np.ndarray = completion_costs(
         problem.durations, facts.waiting, problem.near, problem.deadlines, facts.unit, order, len(done),
-        schedule.doers, start, finish, schedule.free_at, start, attempt.choices, np.stack([backward, facts.rule_starts]),
+        schedule.doers, start, finish, schedule.free_at, start, attempt.choices,
+        np.stack([backward, facts.rule_starts]),
     )  # fmt: skip
     return costs
 
