@@ -64,8 +64,10 @@ class Agent:
         agent does not exist or its policy needs more than an observation.
         """
         self.handle(ev.Reopened())
+        event: ev.Event | None = None
         while self.protocol.ended is None:
-            event = self.transport.receive(max(self.protocol.wake_at - self._clock(), 0.0))
+            attentive = self.protocol.attentive or event is None
+            event = self.transport.receive(max(self.protocol.wake_at - self._clock(), 0.0), attentive=attentive)
             self.handle(ev.Wake() if event is None else event)
         if self.protocol.ended.ending == ev.Ending.FAILED:
             raise DeploymentError(f"agent {self.options.agent}: {self.protocol.ended.reason}")
@@ -87,8 +89,8 @@ class Agent:
                 case ev.Reopen():
                     self.transport.reopen()
                     self.handle(ev.Reopened())
-                case ev.Subscribe(key):
-                    self.transport.subscribe(key)
+                case ev.Subscribe(key, quiet):
+                    self.transport.subscribe(key, quiet=quiet)
                 case ev.Unsubscribe(key):
                     self.transport.unsubscribe(key)
                 case ev.Watch(key):

@@ -59,7 +59,7 @@ class Bus:
             for _ in range(1 if self.deliver is None else self.deliver(key, payload)):
                 for node in self.nodes:
                     if node is not sender and node.hears(key):
-                        node.inbox.put(key, Received(key, payload))
+                        node.inbox.put(key, Received(key, payload), quiet=key in node.quiet)
 
     def set_token(self, holder: Node, key: str, *, stands: bool) -> None:
         """Let a token stand or go, and tell those who watch it."""
@@ -90,6 +90,7 @@ class Node:
         self.bus, self.inbox = bus, Inbox()
         self.dropped: Counter[str] = self.inbox.dropped
         self.subscribed: set[str] = set()
+        self.quiet: set[str] = set()  # those of them that wake nobody
         self.wild: set[str] = set()  # those of them that hold wildcards
         self.watched: set[str] = set()
         self.served: set[str] = set()
@@ -109,18 +110,20 @@ class Node:
             self.on_put(key, payload)
         self.bus.put(self, key, payload)
 
-    def receive(self, timeout: float) -> Event | None:
+    def receive(self, timeout: float, *, attentive: bool = True) -> Event | None:
         """See Transport.receive."""
-        return self.inbox.get(timeout)
+        return self.inbox.get(timeout, attentive=attentive)
 
     def inject(self, event: Event) -> None:
         """See Transport.inject."""
         self.inbox.inject(event)
 
-    def subscribe(self, key: str) -> None:
+    def subscribe(self, key: str, *, quiet: bool = False) -> None:
         """See Transport.subscribe."""
         with self.bus.lock:
             self.subscribed.add(key)
+            if quiet:
+                self.quiet.add(key)
             if "*" in key:
                 self.wild.add(key)
 
@@ -128,6 +131,7 @@ class Node:
         """See Transport.unsubscribe."""
         with self.bus.lock:
             self.subscribed.discard(key)
+            self.quiet.discard(key)
             self.wild.discard(key)
 
     def watch(self, key: str) -> None:
@@ -177,7 +181,7 @@ class Node:
     def _disconnect(self) -> None:
         for token in [token for token, holder in self.bus.tokens.items() if holder is self]:
             self.bus.set_token(self, token, stands=False)
-        for keys in (self.subscribed, self.wild, self.watched, self.served):
+        for keys in (self.subscribed, self.quiet, self.wild, self.watched, self.served):
             keys.clear()
         if self in self.bus.nodes:
             self.bus.nodes.remove(self)

@@ -9,6 +9,7 @@ By hand: `marl-sched world`, or `python -m marl_sched.comms.world OPTIONS`, whic
 from __future__ import annotations
 
 import logging
+import math
 import os
 import time
 from collections import Counter
@@ -33,6 +34,7 @@ from marl_sched.errors import DeploymentError, InvalidMessageError
 from marl_sched.files import write_json
 
 log = logging.getLogger(__name__)
+TELL = 0.05  # seconds between two words of progress, unless the phase changes
 Progress = Callable[[str, int, int], None]  # (phase, how much of the horizon has passed, horizon)
 
 
@@ -98,6 +100,7 @@ class World:
         self._warnings = ThrottledLog(log)
         self._progress = progress or (lambda phase, tick, horizon: None)
         self._told: tuple[str, int] = ("", -1)
+        self._tell_at = -math.inf
         self._chosen: dict[int, ev.Choice] = {}  # by agents whose turn has not come yet
         self._tick = self._passed = 0
         self._applied = False  # choices, and the plant has not been asked yet where it stands now
@@ -236,10 +239,10 @@ class World:
         log.info("%s %d: %s %s", self.telemetry.time_unit, self._tick, name, note.event)
 
     def _tell_progress(self) -> None:
-        now = (self.protocol.phase, self._passed)
-        if now != self._told:
-            self._told = now
-            self._progress(*now, self.options.problem.horizon)
+        now, told = self._clock(), (self.protocol.phase, self._passed)
+        if told[0] != self._told[0] or (told != self._told and now >= self._tell_at):
+            self._told, self._tell_at = told, now + TELL
+            self._progress(*told, self.options.problem.horizon)
 
     def _report(self, ending: ev.End, seconds: float) -> RunReport:
         self.metrics.counts.update(self.transport.dropped)

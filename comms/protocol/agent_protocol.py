@@ -100,6 +100,11 @@ class AgentProtocol:
         self.wake_at = self._next_wake()
         return out
 
+    @property
+    def attentive(self) -> bool:
+        """Whether the state of a channel matters now; if not, it may wait unread until the next turn or wake-up."""
+        return self.state != AgentState.SERVING or self._turn is not None or self._question.key is not None
+
     def _notice_sleep(self, now: float) -> None:
         slept = now - max(self._last, self.wake_at)
         if slept > self.rules.slept and self._choosing is None:
@@ -200,7 +205,7 @@ class AgentProtocol:
             self._versions, self._sent = {}, None
             wanted = {keys.CLOCK, self._keys.turn(self._agent), *channels}
             out += [ev.Unsubscribe(key) for key in sorted(self.subscriptions - wanted)]
-            out += [ev.Subscribe(key) for key in sorted(wanted - self.subscriptions)]
+            out += [ev.Subscribe(key, quiet=key in channels) for key in sorted(wanted - self.subscriptions)]
             self.subscriptions = wanted
             if frame.epoch != self._epoch:
                 self._forget(out)
@@ -342,7 +347,7 @@ class AgentProtocol:
 
     def _take(self, turn: wire.Turn, now: float, out: list[ev.Effect]) -> None:
         again = self._turn == turn
-        self._turn = turn
+        self._turn, self._tick = turn, turn.tick
         if again and self._lacks(turn) and self._question.key is None:
             self._ask_snapshot(now, out)
         else:

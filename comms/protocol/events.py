@@ -237,9 +237,10 @@ class End:
 
 @dataclass(frozen=True, slots=True)
 class Subscribe:
-    """Hear a key."""
+    """Hear a key; what is `quiet` may wait unread until something else is heard or the protocol wants to be woken."""
 
     key: str
+    quiet: bool = False
 
 
 @dataclass(frozen=True, slots=True)

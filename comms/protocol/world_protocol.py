@@ -145,7 +145,7 @@ class WorldProtocol:
     def _pass_time(self, now: float, out: list[ev.Effect]) -> None:
         if self.ended is not None:
             return
-        if self.phase != "over" and now >= self._slots_due():
+        if now >= self._slots_due():
             self._watch_slots(now, out)
             self._slots_seen = -1
         if self.phase == "over":
@@ -195,8 +195,11 @@ class WorldProtocol:
     def _slots_due(self) -> float:
         """When a slot may have to be looked at, at the earliest; hearing an agent only makes it later.
 
-        With a hundred agents, looking at all slots at every event would be most of what an event costs.
+        With a hundred agents, looking at all slots at every event would be most of what an event costs. When the run is
+        over they are not looked at any more.
         """
+        if self.phase == "over":
+            return math.inf
         if self._slots_seen != self.members.moves.all:
             self._slots_seen = self.members.moves.all
             due = [slot.until for slot in self.members.slots]
@@ -331,7 +334,7 @@ class WorldProtocol:
             out.append(ev.Put(channel, news))
         self._poll_at = -math.inf if event.requests or event.over else now + self.rules.poll
         if event.tick != self._tick:
-            self._tick, self._clock_at = event.tick, now
+            self._tick = event.tick
             self._begin_tick()
         self._open = {request.agent: OpenTurn(request) for request in event.requests}
         self._choices, self._applying, self._over = {}, False, event.over

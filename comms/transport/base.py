@@ -22,14 +22,14 @@ class Transport(Protocol):
     def put(self, key: str, payload: bytes, *, control: bool = False) -> None:
         """Send. What is not `control` may wait for a moment to travel with more of its kind."""
 
-    def receive(self, timeout: float) -> Event | None:
-        """The next event, None if none came within `timeout` seconds."""
+    def receive(self, timeout: float, *, attentive: bool = True) -> Event | None:
+        """The next event, None if none came within `timeout` seconds; quiet ones only for who is `attentive`."""
 
     def inject(self, event: Event) -> None:
         """Have `receive` return an event of this process itself; may be called from a signal handler."""
 
-    def subscribe(self, key: str) -> None:
-        """Hear messages sent by other sessions on a key, which may hold wildcards."""
+    def subscribe(self, key: str, *, quiet: bool = False) -> None:
+        """Hear messages sent by other sessions on a key, which may hold wildcards; `quiet` ones wake nobody."""
 
     def unsubscribe(self, key: str) -> None:
         """Hear them no longer."""

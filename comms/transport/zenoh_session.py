@@ -64,15 +64,15 @@ class ZenohTransport:
         """See Transport.put."""
         self._session.put(self._prefix + key, payload, express=control, congestion_control=zenoh.CongestionControl.DROP)
 
-    def receive(self, timeout: float) -> Event | None:
+    def receive(self, timeout: float, *, attentive: bool = True) -> Event | None:
         """See Transport.receive."""
-        return self._inbox.get(timeout)
+        return self._inbox.get(timeout, attentive=attentive)
 
     def inject(self, event: Event) -> None:
         """See Transport.inject."""
         self._inbox.inject(event)
 
-    def subscribe(self, key: str) -> None:
+    def subscribe(self, key: str, *, quiet: bool = False) -> None:
         """See Transport.subscribe."""
 
         def note(sample: zenoh.Sample) -> None:
@@ -80,7 +80,7 @@ class ZenohTransport:
             if len(sample.payload) > MAX_PAYLOAD or len(name) > MAX_KEY:
                 self.dropped["too_long"] += 1
             else:
-                self._inbox.put(name, Received(name, sample.payload.to_bytes()))
+                self._inbox.put(name, Received(name, sample.payload.to_bytes()), quiet=quiet)
 
         origin = zenoh.Locality.REMOTE
         self._subscribers[key] = self._session.declare_subscriber(self._prefix + key, note, allowed_origin=origin)

@@ -10,10 +10,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from operator import itemgetter
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from marl_sched.envs.airme.features import graph_spec
@@ -47,14 +45,21 @@ def apart(a: int, b: int, n_crews: int) -> int:
 
 def _restore(planes: np.ndarray, statuses: Sequence[PlaneStatus]) -> None:
     """Write statuses into planes, PLANE (P + 1,). Who has one in hand stays unknown: crew 0 stands for anybody."""
-    for status in statuses:
-        told = dict(zip(PlaneStatus.__struct_fields__, msgspec.structs.astuple(status), strict=True))
-        told["crew"] = 0 if status.in_hand == REPAIRED else -1
-        told["chosen"] = 0 if status.in_hand == CHOSEN else -1
-        planes[status.slot] = _in_order(told)  # a record in one piece: field by field it takes ten times as long
-
-
-_in_order = itemgetter(*(PLANE.names or ()))
+    for told in statuses:  # in the order of PLANE: a record in one piece takes a tenth of the time of its fields
+        planes[told.slot] = (
+            told.income,
+            told.job_cost,
+            told.hours,
+            told.landings,
+            told.kind,
+            0 if told.in_hand == REPAIRED else -1,
+            told.job_hours,
+            told.job_done,
+            told.mission_hours,
+            told.mission_done,
+            0 if told.in_hand == CHOSEN else -1,
+            told.broken,
+        )
 
 
 class AirmeLocalState:
@@ -108,9 +113,7 @@ class AirmeLocalState:
     def _hear_crew(self, crew: int, said: CrewStatus) -> None:
         if max(said.plane, said.choice) > self._frame.n_planes:
             raise InvalidMessageError(f"crew {crew}: a plane beyond the {self._frame.n_planes} that there are")
-        record = self._state.crews[0, crew]
-        for name in CREW.names or ():
-            record[name] = getattr(said, name)
+        self._state.crews[0, crew] = (said.plane, said.job_hours, said.job_done, said.choice)  # in the order of CREW
         if crew == self._agent:
             self._state.rows["time"] = said.hour  # its own clock: the hour in which the crew decides
 

@@ -88,7 +88,7 @@ def test_agent_finds_the_world_catches_up_announces_itself_and_says_hello():
     assert agent.first == [ev.Watch(keys.WORLD_ALIVE), ev.Ask(1, keys.FRAME, None)]
     assert agent.answer(0.25, FRAME) == [
         ev.Subscribe("bot/1/turn"),
-        ev.Subscribe(CHANNEL),
+        ev.Subscribe(CHANNEL, quiet=True),
         ev.Subscribe(keys.CLOCK),
         ev.Ask(2, keys.snapshot(1), wire.SnapshotRequest(**US, agent=1)),
     ]
@@ -194,7 +194,7 @@ def test_world_that_comes_back_as_another_epoch_meets_a_new_incarnation_with_an_
     agent.mind.channels = ("state/0",)
     effects = agent.answer(1.1, wire.Frame(run=RUN, epoch="e2", env="toy", agents=2, heartbeat=0.5, problem=b"f"))
     assert ev.Unsubscribe(CHANNEL) in effects  # a narrower view
-    assert ev.Subscribe("state/0") in effects
+    assert ev.Subscribe("state/0", quiet=True) in effects
     assert ev.Withdraw("bot/1/alive/me-1") in effects
     assert ev.Announce("bot/1/alive/me-2") in agent.answer(
         1.2, wire.Snapshot(run=RUN, epoch="e2", tick=0, phase="gathering", channels=[])
@@ -210,7 +210,7 @@ def test_world_that_is_silent_is_reached_for_by_a_new_session_and_met_as_the_sam
     assert now == pytest.approx(4.25)
     assert of(agent.at(4.5, ev.Reopened()), ev.Ask)
     effects = agent.answer(4.6, FRAME)
-    assert ev.Subscribe(CHANNEL) in effects
+    assert ev.Subscribe(CHANNEL, quiet=True) in effects
     assert ev.Announce("bot/1/alive/me-1") in agent.answer(4.7, snapshot())
 
 

@@ -26,6 +26,20 @@ def test_newer_message_takes_the_place_of_one_that_waits_by_the_same_key():
     assert inbox.dropped == {"replaced": 999}
 
 
+def test_quiet_events_wait_as_the_newest_of_their_place_until_somebody_is_attentive():
+    inbox = Inbox()
+    assert inbox.get(0.0, attentive=False) is None
+    for payload in (b"1", b"2"):
+        inbox.put("state", ev.Received("state", payload), quiet=True)
+    inbox.put("turn", ev.Received("turn", b"t"))
+    assert inbox.get(0.0, attentive=False) == ev.Received("turn", b"t")
+    assert inbox.get(0.0, attentive=False) is None
+    assert inbox.get(0.0) == ev.Received("state", b"2")
+    inbox.put("state", ev.Received("state", b"3"), quiet=True)  # somebody waits for it
+    assert inbox.get(0.0) == ev.Received("state", b"3")
+    assert not inbox.dropped
+
+
 def test_keys_beyond_the_bound_find_no_place():
     inbox = Inbox(max_pending=3)
     assert [inbox.put(i, ev.Wake()) for i in range(5)] == [True, True, True, False, False]

@@ -79,8 +79,8 @@ class Echo:
                     self.handle(ev.Chosen(turn.sequence, 1), now)
                 case ev.Announce(key):
                     self.node.announce(key)
-                case ev.Subscribe(key):
-                    self.node.subscribe(key)
+                case ev.Subscribe(key, quiet):
+                    self.node.subscribe(key, quiet=quiet)
                 case ev.Watch(key):
                     self.node.watch(key)
 

@@ -351,6 +351,17 @@ def test_29_end_of_the_run_waits_for_goodbyes_no_longer_than_the_farewell():
     assert world.at(3.5)[-1] == ev.End(ev.Ending.COMPLETE)
 
 
+def test_a_world_that_is_over_does_not_look_at_its_slots_again_and_again():
+    """An agent that is not heard any more is due at 3 s after its last word, long before the farewell's end."""
+    world, turn = running(n=1, ticks=1, farewell=20.0, unheard=3.0)
+    world.decide(1.5, turn)
+    for _ in range(100):
+        now = world.protocol.wake_at
+        world.after_sleep(now)
+        assert world.protocol.wake_at > now
+    assert world.protocol.phase == "over"
+
+
 def test_frame_and_snapshot_say_run_epoch_and_no_more_than_the_agent_may_hear():
     world, _ = running()
     (frame,) = of(world.at(1.0, ev.Queried(keys.FRAME, b"", 1)), ev.Reply)
