@@ -103,7 +103,7 @@ class AgentProtocol:
     @property
     def attentive(self) -> bool:
         """Whether the state of a channel matters now; if not, it may wait unread until the next turn or wake-up."""
-        return self.state != AgentState.SERVING or self._turn is not None or self._question.key is not None
+        return self._turn is not None
 
     def _notice_sleep(self, now: float) -> None:
         slept = now - max(self._last, self.wake_at)

@@ -1,7 +1,8 @@
 """Zenoh as the world and the agents use it: a star on explicit TCP endpoints, and one bounded inbox.
 
 The world is the hub: a peer that listens. Agents are clients that connect to it. Callbacks run on Zenoh's own threads
-and do nothing but put an event into the inbox. Scouting and shared memory are off. Nothing is sent with Zenoh's
+and do nothing but put an event into the inbox; the newest state of each channel waits in a ring of Zenoh's own until a
+turn needs it. Scouting and shared memory are off. Nothing is sent with Zenoh's
 blocking congestion control, so that no reader, however slow or frozen, can hold up a sender; the protocol sends
 again what is lost.
 
@@ -44,6 +45,7 @@ KNOCK, KNOCK_AGAIN = 10.0, 0.2  # seconds that a TLS handshake may take, and unt
 MAX_QUERIES, MAX_ALIKE = 256, 4  # that wait for an answer, in all and by one key; more are dropped
 QUERY_TIMEOUT = 10.0
 CLOSE_S = 1.0  # for which a session may take to close
+LOOK_AGAIN = 0.001  # seconds until somebody who is attentive looks into the rings again
 ACCEPT_MS = 2000  # for which a connection may be half open
 
 
@@ -59,6 +61,7 @@ class ZenohTransport:
         self._session = connect()
         self._tokens: dict[str, zenoh.LivelinessToken] = {}
         self._subscribers: dict[str, Any] = {}
+        self._rings: dict[str, Any] = {}  # subscribers of one quiet key each, with its newest sample
 
     def put(self, key: str, payload: bytes, *, control: bool = False) -> None:
         """See Transport.put."""
@@ -66,7 +69,29 @@ class ZenohTransport:
 
     def receive(self, timeout: float, *, attentive: bool = True) -> Event | None:
         """See Transport.receive."""
-        return self._inbox.get(timeout, attentive=attentive)
+        if not attentive or not self._rings:
+            return self._inbox.get(timeout)
+        end = time.monotonic() + timeout
+        while True:
+            self._collect()
+            left = end - time.monotonic()
+            event = self._inbox.get(min(LOOK_AGAIN, max(left, 0.0)))
+            if event is not None or left <= LOOK_AGAIN:
+                return event
+
+    def _collect(self) -> None:
+        """Take quiet samples out of Zenoh's rings, in which no Python code looks at them."""
+        for ring in self._rings.values():
+            sample = ring.try_recv()
+            if sample is not None:
+                self._take_in(sample)
+
+    def _take_in(self, sample: zenoh.Sample) -> None:
+        name = self._local(sample.key_expr)
+        if len(sample.payload) > MAX_PAYLOAD or len(name) > MAX_KEY:
+            self.dropped["too_long"] += 1
+        else:
+            self._inbox.put(name, Received(name, sample.payload.to_bytes()))
 
     def inject(self, event: Event) -> None:
         """See Transport.inject."""
@@ -74,20 +99,16 @@ class ZenohTransport:
 
     def subscribe(self, key: str, *, quiet: bool = False) -> None:
         """See Transport.subscribe."""
-
-        def note(sample: zenoh.Sample) -> None:
-            name = self._local(sample.key_expr)
-            if len(sample.payload) > MAX_PAYLOAD or len(name) > MAX_KEY:
-                self.dropped["too_long"] += 1
-            else:
-                self._inbox.put(name, Received(name, sample.payload.to_bytes()), quiet=quiet)
-
-        origin = zenoh.Locality.REMOTE
-        self._subscribers[key] = self._session.declare_subscriber(self._prefix + key, note, allowed_origin=origin)
+        origin, name = zenoh.Locality.REMOTE, self._prefix + key
+        if quiet:
+            ring = zenoh.handlers.RingChannel(1)
+            self._rings[key] = self._session.declare_subscriber(name, ring, allowed_origin=origin)
+        else:
+            self._subscribers[key] = self._session.declare_subscriber(name, self._take_in, allowed_origin=origin)
 
     def unsubscribe(self, key: str) -> None:
         """See Transport.unsubscribe."""
-        self._subscribers.pop(key).undeclare()
+        (self._rings if key in self._rings else self._subscribers).pop(key).undeclare()
 
     def watch(self, key: str) -> None:
         """See Transport.watch."""
@@ -151,7 +172,7 @@ class ZenohTransport:
 
     def close(self) -> None:
         """See Transport.close."""
-        self._tokens, self._subscribers = {}, {}
+        self._tokens, self._subscribers, self._rings = {}, {}, {}
         closing = threading.Thread(target=_close, args=(self._session,), daemon=True)
         closing.start()
         closing.join(CLOSE_S)
