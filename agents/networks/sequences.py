@@ -70,6 +70,20 @@ class SequenceNetwork(PlannerNetwork):
         """
 
     @abstractmethod
+    def choice_log_probs(self, situations: Any, orders: np.ndarray, seen: Any) -> Tensor:
+        """Log-probabilities of all choices that could be next along sequences, int64 (P, S, N, k): (P, S, L, M).
+
+        The lowest finite number for those that cannot, and behind a sequence's end.
+        """
+
+    @abstractmethod
+    def choice_costs(self, situations: Any, orders: np.ndarray) -> np.ndarray:
+        """What sequences would cost if a rule completed them behind each of these choices, float64 (P, S, L, M).
+
+        inf for what cannot be next.
+        """
+
+    @abstractmethod
     def selected_seen(self, seen: Any, rows: np.ndarray, samples: int) -> Any:
         """What was seen on the way of `samples` sequences for each of some of the situations, int64 (K,)."""
 

@@ -12,7 +12,14 @@ from torch import nn
 from torch.nn import functional
 
 from marl_sched.agents.murse.lst import lst_plan
-from marl_sched.agents.murse.networks.hybridnet.decoding import AGENT, TASK, draw_pairs, masked_log_probs
+from marl_sched.agents.murse.networks.hybridnet.decoding import (
+    AGENT,
+    TASK,
+    costs_along,
+    draw_pairs,
+    masked_log_probs,
+    pair_log_probs,
+)
 from marl_sched.agents.murse.networks.hybridnet.encoder import (
     METAGRAPH,
     NODES,
@@ -346,3 +353,38 @@ def test_appraisals_end_at_what_a_schedule_costs_and_stand_still_while_the_rule_
         followed = draw_pairs(net, alone, appraise=True).appraisals
     assert followed is not None
     np.testing.assert_allclose(followed, followed[0, 0, 0], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "net", [network(), network("rule", timed=True), interactive()], ids=["pure", "timed", "hetgat"]
+)
+def test_all_pairs_that_could_be_next_share_the_probability_and_the_chosen_one_has_its_own(net: PairNetwork):
+    rounds = rounds_of([*small(2), three_tasks()])
+    n = rounds.shape[1]
+    with torch.no_grad():
+        drawn = draw_pairs(net, rounds, 2, uniforms=uniforms(rounds, 2))
+        every = pair_log_probs(net, rounds, drawn.orders, drawn.seen)
+    chosen = torch.from_numpy(drawn.orders[..., AGENT] * n + drawn.orders[..., TASK])[..., None]
+    for k, count in enumerate(rounds.sizes[:, 0].tolist()):
+        torch.testing.assert_close(
+            every[k, :, :count].gather(2, chosen[k, :, :count])[..., 0], drawn.log_probs[k, :, :count],
+            rtol=1e-5, atol=1e-5,
+        )  # fmt: skip
+        torch.testing.assert_close(every[k, :, :count].exp().sum(2), torch.ones(2, count))
+
+
+def test_pairs_cost_what_the_rule_makes_of_the_rest_and_the_best_is_no_worse_than_the_rule():
+    """At the end nothing is left to complete: the last pair costs what the schedule does."""
+    rounds = rounds_of([*small(3), three_tasks()])
+    with torch.no_grad():
+        drawn = draw_pairs(network("rule"), rounds, 1, uniforms=uniforms(rounds, 1), appraise=True)
+    costs, n = costs_along(rounds, drawn.orders), rounds.shape[1]
+    assert drawn.appraisals is not None
+    for k, count in enumerate(rounds.sizes[:, 0].tolist()):
+        assert (costs[k, 0, :count].min(axis=1) <= drawn.appraisals[k, 0, :count] + 1e-9).all()
+        task, agent = drawn.orders[k, 0, count - 1]
+        assert costs[k, 0, count - 1, agent * n + task] == pytest.approx(drawn.appraisals[k, 0, count])
+        assert np.isinf(costs[k, 0, count:]).all()
+    awaited = costs[3, 0, 0].reshape(-1, n)  # task 3 of three_tasks waits for task 1
+    assert np.isinf(awaited[:, 2:]).all()
+    assert np.isfinite(awaited[:2, :2]).all()

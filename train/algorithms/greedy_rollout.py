@@ -34,15 +34,14 @@ from marl_sched.agents.networks.network import PolicyNetwork
 from marl_sched.agents.networks.sequences import SequenceNetwork
 from marl_sched.agents.planning import TeamPlanner
 from marl_sched.agents.registry import create_scheduler
-from marl_sched.domain import get_domain
 from marl_sched.errors import InvalidOptionError
 from marl_sched.simulation import TurnSimulator
 from marl_sched.train.algorithms.base import NAME, AlgorithmConfig, Setup
 from marl_sched.train.bounds import Count, NonNegative, Positive, Share
 from marl_sched.train.collect import Collector
-from marl_sched.train.device import device_of
 from marl_sched.train.learner import Learner
 from marl_sched.train.ppo import between, means
+from marl_sched.train.sequence_play import instances_of_update, sequence_network
 
 if TYPE_CHECKING:
     from marl_sched.train.config import TrainConfig
@@ -88,19 +87,7 @@ class GreedyRolloutConfig(
 
     def build(self, setup: Setup) -> tuple[Collector, Learner]:
         """See AlgorithmConfig; InvalidOptionError for a network that draws no sequences, and on a GPU."""
-        config = setup.config
-        if config.collector.name != "sync":
-            raise InvalidOptionError(
-                f"train: collector: sequences are played in this process: expected sync, got {config.collector.name}"
-            )
-        domain = get_domain(config.env.name)
-        network = setup.policy_for(setup.problem(domain.default_scale, count=1).simulator())
-        if not isinstance(network, SequenceNetwork):
-            raise InvalidOptionError(
-                f"train: policy: greedy_rollout is for networks that draw sequences, got {config.policy.network_name()}"
-            )
-        if device_of(network).type != "cpu":
-            raise InvalidOptionError("train: device: sequences are drawn on the CPU: expected device=cpu")
+        network = sequence_network(setup)
         baseline = copy.deepcopy(network).requires_grad_(False)
         return SequenceCollector(self, setup, baseline), GreedyRollout(network, baseline, self)
 
@@ -185,8 +172,7 @@ class SequenceCollector:
     name = "sync"
 
     def __init__(self, config: GreedyRolloutConfig, setup: Setup, baseline: SequenceNetwork) -> None:
-        self._config, self._baseline, self._run = config, baseline, setup.config
-        self._problems = [setup.problem(scale, horizon=config.rounds) for scale in setup.config.env.scales]
+        self._config, self._baseline, self._setup, self._run = config, baseline, setup, setup.config
         self._teacher: TeamPlanner[Any] | None = None
         if config.teacher is not None and config.teacher_share:
             teacher = create_scheduler(config.teacher, setup.config.env.name, **config.teacher_options)
@@ -197,13 +183,8 @@ class SequenceCollector:
 
     def simulator(self) -> TurnSimulator:
         """Every instance of this update `samples` + 1 times in a row, the last one for the baseline."""
-        config, problem = self._config, self._problems[self._updates % len(self._problems)]
-        first, copies = self._updates * config.instances, config.samples + 1
-        instances = [problem.instance(first + k) for k in range(config.instances)]
-        simulator = problem.simulator_of([instance for instance in instances for _ in range(copies)], pad=None)
-        episodes = problem.episode_numbers([self._updates] * simulator.batch)
-        simulator.reset(seed=problem.seed, episodes=episodes)
-        return simulator
+        config = self._config
+        return instances_of_update(self._setup, self._updates, config.instances, config.samples + 1, config.rounds)
 
     def collect(self, policy: PolicyNetwork, length: int) -> Sequences:
         """Play the update's instances."""

@@ -16,6 +16,7 @@ from marl_sched.agents.murse.rollout import CHARGES, cost_of
 from marl_sched.envs.murse.instance import NO_DEADLINE
 from marl_sched.envs.murse.rollout import (
     HORIZON_SHARE,
+    UNREACHABLE,
     Plan,
     Problem,
     Progress,
@@ -37,12 +38,16 @@ from marl_sched.kernels import kernel
 TASK_FEATURES = (
     "open", "has_deadline", "deadline", "latest_start", "earliest_start", "slack", "tail", "min_duration",
     "mean_duration", "max_duration", "std_duration", "mean_spread", "waits_unheeded", "waited_for", "work_near",
-    "rank", "planned_start", "planned_finish", "planned_lateness", "weight", "start", "finish",
+    "rank", "planned_start", "planned_finish", "planned_lateness", "weight", "start", "finish", "is_due",
+    "time_to_spare",
 )  # fmt: skip
 AGENT_FEATURES = (
     "robot", "human", "mean_duration", "fastest_share", "price", "ready", "tasks_share", "planned_finish",
 )  # fmt: skip
-PAIR_FEATURES = ("eligible", "mean", "spread", "repetitions/10", "regret", "reduced_cost", "planned", "finish")
+PAIR_FEATURES = (
+    "eligible", "mean", "spread", "repetitions/10", "regret", "reduced_cost", "planned", "finish", "start_gap",
+    "finish_gap", "breaks/10", "broken_time",
+)  # fmt: skip
 STATE_FEATURES = (
     "tasks/40", "agents/5", "tasks_per_agent/10", "mean_load", "deadline_share", "wait_share", "dispatched_share",
     "planned_makespan", "planned_lateness", "robot_share",
@@ -132,6 +137,8 @@ def write_features(rounds: Rounds, partial: Partial, out: Features) -> None:
         write_tasks(rounds, partial, r, problem, progress, shortest, latest, tail, unit, out)
         write_plan(r, problem, plan, then, count, unit, out)
         write_pairs(rounds, partial, r, problem, progress, prices, cheapest, unit, out)
+        latest_starts(problem, shortest, UNREACHABLE, latest)
+        write_breaks(r, problem, progress, latest, unit, out)
         write_edges(rounds, r, problem, progress, shortest, unit, out)
         state = out.state[r]
         state[0], state[1], state[2] = n / 40.0, m / 5.0, n / m / 10.0
@@ -286,6 +293,83 @@ def write_pairs(
             begin = max(progress.ready[agent], progress.earliest[task])
             pair[7] = (begin + lasts) / unit if progress.open[task] else progress.finish[task] / unit
         row[2] /= max(able, 1)
+
+
+@kernel
+def soonest_agents(problem: Problem, progress: Progress, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Who of those who are eligible for each task is ready first, int64 (N,).
+
+    Writes when that one and the next one are ready, int64 (N,) each, UNREACHABLE for nobody.
+    """
+    whose = np.zeros(len(first), np.int64)
+    first[:], second[:] = UNREACHABLE, UNREACHABLE
+    for task in range(len(first)):
+        for agent in range(len(progress.ready)):
+            ready = progress.ready[agent]
+            if problem.durations[task, agent] >= 0 and ready < first[task]:
+                first[task], second[task], whose[task] = ready, first[task], agent
+            elif problem.durations[task, agent] >= 0:
+                second[task] = min(second[task], ready)
+    return whose
+
+
+@kernel
+def write_breaks(r: int, problem: Problem, progress: Progress, latest: np.ndarray, unit: float, out: Features) -> None:
+    """What taking a pair next would do to deadlines, by `latest` starts, int64 (N,), that follow from deadlines alone.
+
+    Gaps are how much later than the earliest of all pairs that could be next a pair starts and finishes.
+    """
+    n, m = problem.durations.shape
+    first, second = np.empty(n, np.int64), np.empty(n, np.int64)
+    whose = soonest_agents(problem, progress, first, second)
+    due = progress.open & (latest < UNREACHABLE // 2)
+    now, starts, ends = np.maximum(first, progress.earliest), UNREACHABLE, UNREACHABLE
+    for task in range(n):
+        if due[task]:
+            out.task[r, task, 22], out.task[r, task, 23] = 1.0, (latest[task] - now[task]) / unit
+        for agent in range(m):
+            if progress.open[task] and progress.missing[task] == 0 and problem.durations[task, agent] >= 0:
+                begin = max(progress.ready[agent], progress.earliest[task])
+                starts, ends = min(starts, begin), min(ends, begin + problem.durations[task, agent])
+    for task in range(n):
+        for agent in range(m):
+            if progress.open[task] and progress.missing[task] == 0 and problem.durations[task, agent] >= 0:
+                begin = max(progress.ready[agent], progress.earliest[task])
+                finish, pair = begin + problem.durations[task, agent], out.pair[r, task, agent]
+                pair[8], pair[9] = (begin - starts) / unit, (finish - ends) / unit
+                ready = np.where(whose == agent, np.minimum(second, finish), first)
+                broken, late = breaks_behind(problem, progress, task, finish, due, latest, now, ready)
+                pair[10], pair[11] = broken / 10.0, late / unit
+
+
+@kernel
+def breaks_behind(
+    problem: Problem,
+    progress: Progress,
+    task: int,
+    finish: int,
+    due: np.ndarray,
+    latest: np.ndarray,
+    now: np.ndarray,
+    ready: np.ndarray,
+) -> tuple[int, int]:
+    """How many other due tasks, bool (N,), could start in time now and cannot behind `task`, and by how much in all.
+
+    int64 (N,): `latest` starts, the soonest ones `now`, and when somebody would be `ready` for each behind it.
+    """
+    broken, late = 0, 0
+    for other in range(len(due)):
+        if not due[other] or other == task:
+            continue
+        behind = max(ready[other], progress.earliest[other])
+        if problem.lags[other, task] >= 0:
+            behind = max(behind, finish + problem.lags[other, task])
+        elif problem.near[other, task]:
+            behind = max(behind, finish)
+        if behind > latest[other]:
+            broken += now[other] <= latest[other]
+            late += behind - max(now[other], latest[other])
+    return broken, late
 
 
 @kernel

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from marl_sched.agents.base import EpochPlayer
 from marl_sched.agents.murse.following import PlanningScheduler
-from marl_sched.agents.murse.networks.hybridnet.decoding import AGENT, TASK, draw_pairs
+from marl_sched.agents.murse.networks.hybridnet.decoding import AGENT, TASK, costs_along, draw_pairs, pair_log_probs
 from marl_sched.agents.murse.networks.hybridnet.encoder import METAGRAPH
 from marl_sched.agents.murse.networks.hybridnet.features import Features, take_features
 from marl_sched.agents.murse.networks.hybridnet.network import Interactive, PairNetwork, Propagator
@@ -94,6 +94,14 @@ class PairSequences(SequenceNetwork):
     ) -> Drawn:
         """See SequenceNetwork and `draw_pairs`."""
         return draw_pairs(self.pairs, situations, samples, uniforms=uniforms, given=given, seen=seen, appraise=appraise)
+
+    def choice_log_probs(self, situations: Rounds, orders: np.ndarray, seen: list[Features] | None) -> Tensor:
+        """See SequenceNetwork and `pair_log_probs`."""
+        return pair_log_probs(self.pairs, situations, orders, seen)
+
+    def choice_costs(self, situations: Rounds, orders: np.ndarray) -> np.ndarray:
+        """See SequenceNetwork and `pair_costs`."""
+        return costs_along(situations, orders)
 
     def selected_seen(self, seen: list[Features], rows: np.ndarray, samples: int) -> list[Features]:
         """See SequenceNetwork."""

@@ -92,7 +92,7 @@ def agent_ranks(ranks: Ranks, ready: Tensor, n_agents: int) -> Tensor:
 
 
 class Selectors(nn.Module):
-    """Both selectors: one hidden layer each, `hidden` wide.
+    """Both selectors: two hidden layers each, `hidden` wide.
 
     With `residual` their outputs are corrections: the rule's r-th choice has -beta log(1 + r), beta learned, of the
     tasks by latest start (`latest_start`), or of agents and tasks by the rule's schedule (`rule`), and the last layers
@@ -106,6 +106,7 @@ class Selectors(nn.Module):
         self.agent_own, self.agent_state = nn.Linear(hidden, hidden), nn.Linear(hidden, hidden, bias=False)
         self.task_own, self.task_pair = nn.Linear(hidden, hidden), nn.Linear(edge_width, hidden, bias=False)
         self.task_context = nn.Linear(2 * hidden, hidden, bias=False)
+        self.agent_hidden, self.task_hidden = nn.Linear(hidden, hidden), nn.Linear(hidden, hidden)
         self.agent_out, self.task_out = nn.Linear(hidden, 1, bias=False), nn.Linear(hidden, 1, bias=False)
         self.log_beta = nn.Parameter(torch.full((2,), math.log(FIRST_BETA)))
         self.timed = timed
@@ -125,7 +126,7 @@ class Selectors(nn.Module):
         if self.timed and board.now is not None:
             now = self.agent_now(torch.from_numpy(board.now.agent)).unflatten(0, (p, s))
             both = both + now + self.state_now(torch.from_numpy(board.now.state)).view(p, s, 1, -1)
-        logits = self.agent_out(torch.relu(both)).squeeze(-1)
+        logits = self.agent_out(torch.relu(self.agent_hidden(torch.relu(both)))).squeeze(-1)
         if self.residual == "rule":
             ranks = agent_ranks(board.ranks, board.ready, logits.shape[2])
             logits = logits - self.log_beta[0].exp() * torch.log1p(ranks)
@@ -139,7 +140,7 @@ class Selectors(nn.Module):
             pairs = of_agent(torch.from_numpy(board.now.pair), agent.flatten()[:, None]).squeeze(1)
             now = self.task_now(torch.from_numpy(board.now.task)) + self.pair_now(pairs)
             both = both + now.unflatten(0, (p, s))
-        logits = self.task_out(torch.relu(both)).squeeze(-1)
+        logits = self.task_out(torch.relu(self.task_hidden(torch.relu(both)))).squeeze(-1)
         if self.residual != "none":
             ranks = task_ranks(board.ranks, agent, board.candidates(agent))
             logits = logits - self.log_beta[1].exp() * torch.log1p(ranks)
