@@ -117,7 +117,7 @@ policy-murse-local-makespan: policy-murse-full-makespan
 # of one core.
 STEPS := env=murse algorithm=explored_steps curriculum=rounds curriculum.start=1 curriculum.stop=1 validation.every=25 \
 	validation.length=1 validation.baseline=lst algorithm.minibatch=64
-TRAIN_schedulenet := $(STEPS) policy=schedulenet updates=600 algorithm.instances=16 validation.instances=40 'env.scales=[homogeneous-10-small,$(strip \
+TRAIN_schedulenet := $(STEPS) policy=schedulenet updates=400 algorithm.instances=16 validation.instances=40 'env.scales=[homogeneous-10-small,$(strip \
 	)heterogeneous-10-small,homogeneous-10-medium,heterogeneous-5-small,heterogeneous-10-medium]'
 TRAIN_robognn := $(STEPS) policy=robognn updates=300 algorithm.instances=12 validation.instances=30 'env.scales=[robots-small]'
 TRAIN_homgnn-10 := $(STEPS) policy=robognn updates=300 algorithm.instances=12 validation.instances=30 'env.scales=[homogeneous-10-small]'
