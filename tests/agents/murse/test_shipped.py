@@ -21,3 +21,12 @@ def test_the_planning_policy_is_shorter_than_the_rule():
     )
     assert learned["makespan"].mean() < rule["makespan"].mean()
     assert learned["feasible"].mean() >= rule["feasible"].mean()
+
+
+@pytest.mark.parametrize(("name", "scale"), [("robognn", "robots-small")])
+def test_planners_that_build_steps_solve_more_than_the_rule(name: str, scale: str):
+    """One pass, on instances that neither training nor validation nor export has drawn."""
+    problem = Problem("murse", scale=scale, count=60, seed=90003, episodes=1, horizon=1)
+    learned, rule = (evaluate_scheduler(problem, create_scheduler(one, "murse")).measures for one in (name, "lst"))
+    assert learned["feasible"].mean() > rule["feasible"].mean()
+    assert learned["makespan"].mean() < rule["makespan"].mean()
