@@ -15,6 +15,7 @@ from collections.abc import Callable
 from typing import Any
 
 from marl_sched.comms.agent_options import AgentOptions
+from marl_sched.comms.logs import set_up_logs
 from marl_sched.comms.metrics.throttle import ThrottledLog
 from marl_sched.comms.mind import PolicyMind
 from marl_sched.comms.process import interruptible, run_process
@@ -107,6 +108,7 @@ def run(options: AgentOptions, progress: Any = None) -> Counter[str]:
     from marl_sched.comms.transport.zenoh_session import spoke
 
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # one decision is too small to share, and stays bit-equal
+    set_up_logs(options.log_format, f"agent-{options.agent}", options.run)
     log_warnings()
     identity = options.identity()
     transport: Transport = spoke(options.run, options.connect, options.join_timeout, options.lease, identity=identity)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from marl_sched.agents.policies.trained import Runtime
+from marl_sched.comms.logs import LogFormat
 from marl_sched.comms.protocol.keys import run_prefix
 from marl_sched.comms.security.identity import Identity
 from marl_sched.comms.transport.faulty import Faults
@@ -28,6 +29,7 @@ class AgentOptions:
         join_timeout: seconds to wait for the world, at the start and when it has been lost.
         lease: a link that is silent for that many seconds counts as dead.
         faults: what happens to its messages, see `Faults`.
+        log_format: `text`, or `json`: one object a line, on stderr.
         runtime: `torch`, or `onnx`: networks run on onnxruntime, and what the agent sees and its rules are worked out
             without Numba where the domain has a light declaration (marl_sched.light).
     """
@@ -41,12 +43,14 @@ class AgentOptions:
     lease: float = 1.0
     faults: Mapping[str, float] = field(default_factory=dict)
     runtime: Runtime = "torch"
+    log_format: LogFormat = "text"
 
     def __post_init__(self) -> None:
         """Refuse what cannot be run."""
         run_prefix(self.run)
         Faults.of(self.faults)
         require("runtime", self.runtime, get_args(Runtime))
+        require("log_format", self.log_format, get_args(LogFormat))
         require_positive(self, "join_timeout", "lease")
         if self.agent < 0:
             raise InvalidOptionError(f"agent: expected an index >= 0, got {self.agent}")

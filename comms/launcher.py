@@ -156,6 +156,7 @@ class Deployment:
             lease=self.options.world.lease,
             faults=dict(self.options.world.faults),
             runtime=self.options.runtime,
+            log_format=self.options.world.log_format,
         )
         self._start(self._name(agent), AGENT, asdict(options))
 

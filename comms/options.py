@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from marl_sched.agents.policies.trained import Runtime
 from marl_sched.comms.agent_options import DEFAULT_ENDPOINT, require_positive
+from marl_sched.comms.logs import LogFormat
 from marl_sched.comms.protocol.keys import run_prefix
 from marl_sched.comms.protocol.rules import ClockKind, WorldRules
 from marl_sched.comms.security.identity import WORLD, Identity
@@ -62,6 +63,7 @@ class WorldOptions:
         sync: whether every commit is forced to the disk.
         report: file for the JSON report; "" writes none.
         faults: what happens to messages of the world, see `Faults`; of its agents too where they are deployed.
+        log_format: `text`, or `json`: one object a line; of its agents too where they are deployed.
     """
 
     problem: Problem
@@ -85,6 +87,7 @@ class WorldOptions:
     sync: Sync = "never"
     report: str = ""
     faults: Mapping[str, float] = field(default_factory=dict)
+    log_format: LogFormat = "text"
 
     def __post_init__(self) -> None:
         """Refuse what cannot be run."""
@@ -98,6 +101,7 @@ class WorldOptions:
         require("conflict", self.conflict, get_args(Conflict))
         require("clock", self.clock, get_args(ClockKind))
         require("sync", self.sync, get_args(Sync))
+        require("log_format", self.log_format, get_args(LogFormat))
         require_positive(self, "pace", "deadline", "standstill", "ready_timeout", "heartbeat", "lease")
         if self.patience < 1:
             raise InvalidOptionError(f"patience: expected at least 1 missed deadline, got {self.patience}")

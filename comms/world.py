@@ -17,6 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from marl_sched.comms.decision_log import CommitLog, FileLog, Header, MemoryLog, Resumed, Step, play_again
+from marl_sched.comms.logs import set_up_logs
 from marl_sched.comms.metrics.report import RunReport, build_report
 from marl_sched.comms.metrics.run_metrics import RunMetrics
 from marl_sched.comms.metrics.throttle import ThrottledLog
@@ -274,6 +275,7 @@ def serve(options: WorldOptions, progress: Progress | None = None) -> RunReport:
     from marl_sched.comms.transport.endpoints import settle_port
     from marl_sched.comms.transport.zenoh_session import hub
 
+    set_up_logs(options.log_format, "world", options.run)
     commits: CommitLog = MemoryLog()
     if options.log:
         commits = FileLog(Path(options.log), Header.of(options), options.sync)

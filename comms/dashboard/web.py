@@ -1,4 +1,7 @@
-"""A read-only page on this machine that follows a run: `/`, its state as JSON by `/state`, as events by `/events`."""
+"""A read-only page on this machine that follows a run.
+
+`/` is the page; its state comes as JSON by `/state`, as events by `/events`, and for Prometheus by `/metrics`.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +60,7 @@ class Handler(BaseHTTPRequestHandler):
     timeout = 30
 
     def do_GET(self) -> None:
-        """A page, the state, or the events."""
+        """A page, the state, the events, or the metrics."""
         host = (self.headers.get("Host") or "").rpartition(":")[0]
         if host not in (HOST, "localhost"):  # a page of elsewhere whose name was made to mean this machine
             self.send_error(HTTPStatus.FORBIDDEN, "ask for 127.0.0.1 or localhost")
@@ -68,6 +71,8 @@ class Handler(BaseHTTPRequestHandler):
             self._send("application/json", json.dumps(self.server.watcher.state()).encode())
         elif self.path == "/events":
             self._stream()
+        elif self.path == "/metrics":
+            self._send_metrics()
         else:
             self.send_error(HTTPStatus.NOT_FOUND)
 
@@ -77,6 +82,14 @@ class Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Length", str(len(content)))
         self.end_headers()
         self.wfile.write(content)
+
+    def _send_metrics(self) -> None:
+        try:
+            from marl_sched.comms.dashboard.prometheus import CONTENT_TYPE, exposition
+        except ModuleNotFoundError:
+            self.send_error(HTTPStatus.NOT_IMPLEMENTED, "pip install 'marl-sched[metrics]'")
+            return
+        self._send(CONTENT_TYPE, exposition(self.server.watcher.state()))
 
     def _headers(self, kind: str) -> None:
         self.send_header("Content-Type", kind)

@@ -101,7 +101,7 @@ class ZenohTransport:
         """See Transport.subscribe."""
         origin, name = zenoh.Locality.REMOTE, self._prefix + key
         if quiet:
-            ring = zenoh.handlers.RingChannel(1)
+            ring: Any = zenoh.handlers.RingChannel(1)
             self._rings[key] = self._session.declare_subscriber(name, ring, allowed_origin=origin)
         else:
             self._subscribers[key] = self._session.declare_subscriber(name, self._take_in, allowed_origin=origin)

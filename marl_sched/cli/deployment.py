@@ -10,7 +10,7 @@ import typer
 
 from marl_sched.cli import options
 from marl_sched.cli.grouped import DOMAIN_OPTIONS, takes
-from marl_sched.cli.plant_options import Certs, Plant, endpoint_of
+from marl_sched.cli.plant_options import Certs, LogForm, Plant, endpoint_of
 from marl_sched.cli.run_printing import finish, print_report, progress_bar
 from marl_sched.cli.watching import Web, shown, watch
 from marl_sched.errors import InvalidOptionError
@@ -76,6 +76,7 @@ def agent(
     runtime: Annotated[
         str, typer.Option("--runtime", help="What agents decide by: torch, or onnx, without PyTorch and Numba.")
     ] = "torch",
+    log_format: LogForm = "text",
 ) -> None:
     """Be one agent of a run: see through its view and decide with its policy."""
     from marl_sched.comms.agent import run as be_agent
@@ -91,6 +92,7 @@ def agent(
             join_timeout=join_timeout,
             lease=lease,
             runtime=runtime,  # type: ignore[arg-type]  # AgentOptions refuses other words
+            log_format=log_format,  # type: ignore[arg-type]  # likewise
         )
     )
 

@@ -19,6 +19,9 @@ Certs = Annotated[
     Path | None,
     typer.Option("--certs", metavar="DIR", help="Certificates, as `marl-sched certs` makes them, for a tls/ endpoint."),
 ]
+LogForm = Annotated[
+    str, typer.Option("--log-format", help="How processes log: text, or json, an object a line and every event.")
+]
 
 
 def endpoint_of(encrypted: bool, port: int) -> str:
@@ -83,6 +86,7 @@ class Plant:
     sync: Annotated[
         str, typer.Option("--sync", help="When the log is forced to the disk: never, or at every commit.")
     ] = "never"
+    log_format: LogForm = "text"
     own: OwnOptions
 
     def problem(self) -> Problem:
@@ -123,4 +127,5 @@ class Plant:
             log=str(log or ""),
             sync=self.sync,  # type: ignore[arg-type]  # likewise
             report=str(json or ""),
+            log_format=self.log_format,  # type: ignore[arg-type]  # likewise
         )

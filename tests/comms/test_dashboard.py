@@ -143,6 +143,23 @@ def test_page_can_only_be_read_and_only_by_its_own_name(served, method, path, ho
     assert ask(served[0], method, path, host)[0] == status
 
 
+def test_metrics_are_served_for_prometheus(served):
+    parser = pytest.importorskip("prometheus_client.parser", reason="the extra [metrics] is not installed")
+    server, world = served
+    world.put(keys.OBSERVED, observed())
+    wait_for(server, "running")
+    status, body, headers = ask(server, "GET", "/metrics")
+    assert (status, headers["Content-Type"].partition(";")[0]) == (200, "text/plain")
+    samples = [sample for family in parser.text_string_to_metric_families(body.decode()) for sample in family.samples]
+    found = {(sample.name, *sorted(sample.labels.values())): sample.value for sample in samples}
+    assert found["marl_sched_phase", "running", "toy"] == 1
+    assert found["marl_sched_decisions_total", "toy"] == 7
+    assert found["marl_sched_agent_losses_total", "bot_1", "toy"] == 1
+    assert found["marl_sched_agents", "lost", "toy"] == 1
+    assert found["marl_sched_events_total", "denied", "toy"] == 3
+    assert found["marl_sched_objective", "profit", "toy"] == 0.5
+
+
 def test_pages_that_follow_are_bounded(served):
     server, _ = served
     taken = [server.followers.acquire(blocking=False) for _ in range(MAX_FOLLOWERS)]

@@ -73,6 +73,7 @@ def test_a_light_agent_imports_nothing_that_a_robot_does_not_carry(policy, tmp_p
     problem = Problem("airme", instances=[tmp_path / "fleet.json"], horizon=60, view=LOCAL)
     world = WorldOptions(problem=problem, run=run, listen=endpoint, deadline=30.0, ready_timeout=120.0)
     agent = {"agent": 0, "policy": policy, "run": run, "connect": endpoint, "runtime": "onnx", "join_timeout": 120.0}
+    agent["log_format"] = "json"
     command = [sys.executable, "-P", "-c", AGENT, json.dumps(agent)]
     from marl_sched.comms.world import serve
 
