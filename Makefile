@@ -9,7 +9,7 @@ PYTEST_ARGS ?= -n auto --dist worksteal
 
 WORKERS ?= 2
 
-.PHONY: help demo test unit wheel lint docs docs-serve coverage tables-airme tables-murse format clean
+.PHONY: help demo test unit slow wheel lint docs docs-serve coverage tables-airme tables-murse format clean
 
 help: ## what there is to make
 	@grep -hE '^[a-z%-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z%-]+):.*## (.*)/  \1|\2/' | column -t -s '|'
@@ -17,10 +17,13 @@ help: ## what there is to make
 demo: $(INSTALLED) ## seven crews as processes for thirty days, compared with central schedulers; writes out/demo/
 	$(BIN)/marl-sched demo
 
-test: unit wheel ## all tests, then the wheel in a second environment
+test: unit wheel ## tests of a few seconds each, then the wheel in a second environment
 
 unit: $(INSTALLED) ## the tests alone; PYTEST_ARGS="-k noise" are pytest's, by default those that use every core
-	OMP_NUM_THREADS=1 $(BIN)/pytest $(PYTEST_ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/pytest -m "not slow" $(PYTEST_ARGS)
+
+slow: $(INSTALLED) ## tests that take longer: campaigns of faults, tutorials, thousands of problems, index checks
+	OMP_NUM_THREADS=1 $(BIN)/pytest -m slow $(PYTEST_ARGS)
 
 # The second environment borrows the dependencies of the first through a .pth file; the editable install does not
 # come along, since .pth files are not read from there. The wheel must do without the checkout.

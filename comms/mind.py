@@ -14,7 +14,8 @@ from marl_sched.agents.recurrent import LocalAgent, RecurrentScheduler
 from marl_sched.agents.registry import create_scheduler
 from marl_sched.comms.agent_options import AgentOptions
 from marl_sched.comms.protocol import messages as wire
-from marl_sched.domain import Domain, LocalState, get_domain
+from marl_sched.domain import Domain, get_domain
+from marl_sched.domain_parts import LocalState
 from marl_sched.errors import DeploymentError, InvalidMessageError, InvalidOptionError
 from marl_sched.light import LightDomain, light_domain
 

@@ -15,7 +15,8 @@ from marl_sched.comms.protocol.rules import ClockKind, WorldRules
 from marl_sched.comms.security.identity import WORLD, Identity
 from marl_sched.comms.transport.endpoints import is_encrypted, is_loopback
 from marl_sched.comms.transport.faulty import Faults
-from marl_sched.domain import Domain, Telemetry
+from marl_sched.domain import Domain
+from marl_sched.domain_parts import Telemetry
 from marl_sched.errors import InvalidOptionError, require
 from marl_sched.plugins import import_object
 from marl_sched.problem import Problem

@@ -16,7 +16,8 @@ import numpy as np
 
 from marl_sched.comms.protocol.events import Choice, Outcome, PlantAdvanced, Request
 from marl_sched.comms.protocol.messages import Operator, Work
-from marl_sched.domain import Domain, Telemetry
+from marl_sched.domain import Domain
+from marl_sched.domain_parts import Telemetry
 from marl_sched.graph import ACTION_MASK, VISIBLE_SHARE
 from marl_sched.noise import Stream, uniforms
 from marl_sched.simulation import TurnSimulator

@@ -20,7 +20,7 @@ from marl_sched.errors import MarlSchedError
 from marl_sched.plugins import import_object, load_offered, offered
 
 if TYPE_CHECKING:
-    from marl_sched.domain import LocalState
+    from marl_sched.domain_parts import LocalState
     from marl_sched.graph import GraphSpec
 
 GROUP = "marl_sched.light_domains"

@@ -23,7 +23,8 @@ from marl_sched.plugins import OBJECTIVES, import_object, is_object_name, load_o
 from marl_sched.simulation import Observation, TurnSimulator
 
 if TYPE_CHECKING:
-    from marl_sched.domain import CentralInterface, Domain
+    from marl_sched.domain import Domain
+    from marl_sched.domain_parts import CentralInterface
 
 
 class Objective(Protocol):

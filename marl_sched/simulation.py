@@ -17,10 +17,10 @@ import numpy as np
 
 from marl_sched.errors import IllegalActionError, InvalidOptionError
 from marl_sched.graph import ACTION_MASK, ArraySpec, GraphSpec
-from marl_sched.noise import Stream, uniforms
+from marl_sched.noise import Stream, as_seed, episode_key, uniforms
 
 if TYPE_CHECKING:
-    from marl_sched.domain import CentralInterface
+    from marl_sched.domain_parts import CentralInterface
 
 Observation = dict[str, np.ndarray]
 _POLICY = int(Stream.POLICY)  # a compiled function takes fifteen times as long to recognise an IntEnum
@@ -85,6 +85,8 @@ class TurnSimulator(ABC):
     graph: GraphSpec
     arrays: Mapping[str, ArraySpec]
     _observed: Observation | None = None  # the arrays of observe_acting
+    _seeds: np.ndarray  # int64 (B,), see _first_episodes
+    _episodes: np.ndarray  # int64 (B,), the number of each row's episode under its seed
 
     @abstractmethod
     def reset(
@@ -101,6 +103,38 @@ class TurnSimulator(ABC):
         one number for each chosen row in order, says otherwise (rows that share an instance need it).
         `instances`, likewise, replace the rows' instances.
         """
+
+    def _first_episodes(self) -> None:
+        """Let every row stand before episode 0 of seed 0; a domain calls it once, before its first reset."""
+        self._seeds, self._episodes = np.zeros(self.batch, np.int64), np.full(self.batch, -1, np.int64)
+
+    def _next_episodes(
+        self,
+        envs: np.ndarray | None,
+        seed: int | None,
+        instances: Sequence[Any] | None,
+        episodes: Sequence[int] | None,
+    ) -> np.ndarray:
+        """Check the arguments of `reset`, go on to the episodes that they name, and return their rows, int64 (N,).
+
+        Raises InvalidOptionError for a seed outside [0, 2**63) and for other than one instance or number for each row.
+        """
+        rows = np.arange(self.batch) if envs is None else np.flatnonzero(envs)
+        for name, given in (("instances", instances), ("episodes", episodes)):
+            if given is not None and len(given) != len(rows):
+                raise InvalidOptionError(f"{name}: expected one per chosen row ({len(rows)}), got {len(given)}")
+        if seed is None:
+            self._episodes[rows] += 1
+        else:
+            self._seeds[rows], self._episodes[rows] = as_seed(seed), 0
+        if episodes is not None:
+            self._episodes[rows] = episodes
+        return rows
+
+    def _episode_key(self, b: int) -> np.uint64:
+        """Names the noise of row b's episode (marl_sched.noise)."""
+        seed, episode = np.uint64(self._seeds[b]), np.uint64(self._episodes[b])
+        return np.uint64(episode_key(seed, np.uint64(self.instances[b].identity), episode))
 
     @abstractmethod
     def step(self, actions: np.ndarray) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from marl_sched.domain import Demo, Domain
+from marl_sched.domain import Domain
+from marl_sched.domain_parts import Demo
 from marl_sched.envs.airme import render
 from marl_sched.envs.airme.features import pressing
 from marl_sched.envs.airme.instance import SCALES, AirmeInstance, decode, generate, load

@@ -63,7 +63,7 @@ def _restore(planes: np.ndarray, statuses: Sequence[PlaneStatus]) -> None:
 
 
 class AirmeLocalState:
-    """What one crew knows; see marl_sched.domain.LocalState."""
+    """What one crew knows; see marl_sched.domain_parts.LocalState."""
 
     def __init__(self, frame: Frame, agent: int, observe: Observe) -> None:
         if not 0 <= agent < frame.n_crews:

@@ -27,7 +27,6 @@ from marl_sched.envs.airme.state import (
 )
 from marl_sched.envs.airme.views import FullView, View
 from marl_sched.errors import IllegalActionError, InvalidOptionError, require, require_integer
-from marl_sched.noise import as_seed, episode_key
 from marl_sched.simulation import Observation, SavedState, TurnSimulator
 
 DEFAULT_HORIZON = 720
@@ -94,8 +93,7 @@ class AirmeSimulator(TurnSimulator):
             stop_share=float(stop_share or 0.0),
         )
         self._link()
-        self._seeds = np.zeros(self.batch, np.int64)
-        self._episodes = np.full(self.batch, -1, np.int64)
+        self._first_episodes()
         self.reset(seed=seed)
 
     @staticmethod
@@ -135,21 +133,11 @@ class AirmeSimulator(TurnSimulator):
         episodes: Sequence[int] | None = None,
     ) -> None:
         """Start new episodes; see TurnSimulator.reset."""
-        chosen = np.arange(self.batch) if envs is None else np.flatnonzero(envs)
-        for name, given in (("instances", instances), ("episodes", episodes)):
-            if given is not None and len(given) != len(chosen):
-                raise InvalidOptionError(f"{name}: expected one per chosen row ({len(chosen)}), got {len(given)}")
+        chosen = self._next_episodes(envs, seed, instances, episodes)
         if instances is not None:
             for b, instance in zip(chosen, instances, strict=True):
                 self.instances[b] = instance
         self._cover_counters([self.instances[b] for b in chosen])
-        if seed is not None:
-            self._seeds[chosen] = as_seed(seed)
-            self._episodes[chosen] = 0
-        else:
-            self._episodes[chosen] += 1
-        if episodes is not None:
-            self._episodes[chosen] = episodes
         for b in chosen:
             self._start(int(b))
 
@@ -187,9 +175,7 @@ class AirmeSimulator(TurnSimulator):
         row = state.rows[b]
         row["n_planes"], row["n_crews"] = n_planes, n_crews
         row["total_income"] = instance.income.sum()
-        row["episode"] = episode_key(
-            np.uint64(self._seeds[b]), np.uint64(instance.identity), np.uint64(self._episodes[b])
-        )
+        row["episode"] = self._episode_key(b)
         self.limits[b] = self.view.limits_in(row["episode"])
         state.series[b] = 0.0
         state.work[b] = 0

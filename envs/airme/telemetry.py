@@ -63,7 +63,7 @@ def _statuses(planes: np.ndarray, slots: np.ndarray, *, with_chosen: bool) -> li
 
 
 class AirmeTelemetry:
-    """The world's side, and the way to an agent's; see marl_sched.domain.Telemetry."""
+    """The world's side, and the way to an agent's; see marl_sched.domain_parts.Telemetry."""
 
     time_unit = "hour"
 

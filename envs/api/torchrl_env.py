@@ -34,10 +34,10 @@ from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
 from marl_sched.domain import Domain
-from marl_sched.envs.api.legal_actions import CurrentMask, LegalActions
 from marl_sched.envs.api.options import OF_DOMAIN, DefaultScale, as_problem
 from marl_sched.envs.api.sampling import idle_illegal
 from marl_sched.envs.api.saving import SavedEnvironment, SavesState
+from marl_sched.envs.api.torchrl_actions import CurrentMask, LegalActions
 from marl_sched.errors import IllegalActionError, InvalidOptionError
 from marl_sched.graph import ACTION_MASK, ArraySpec
 from marl_sched.noise import Split

@@ -22,7 +22,7 @@ from marl_sched.simulation import Observation
 
 
 class MurseLocalState:
-    """What one agent knows; see marl_sched.domain.LocalState."""
+    """What one agent knows; see marl_sched.domain_parts.LocalState."""
 
     def __init__(self, frame: telemetry.Frame, agent: int) -> None:
         if not 0 <= agent < frame.n_agents:

@@ -15,7 +15,6 @@ from marl_sched.envs.murse.instance import DURATIONS, PROXIMITY, MurseInstance
 from marl_sched.envs.murse.state import NOBODY, load_instance, new_state
 from marl_sched.envs.murse.views import FullView, LocalView
 from marl_sched.errors import IllegalActionError, InvalidOptionError, require, require_integer
-from marl_sched.noise import as_seed, episode_key
 from marl_sched.simulation import Observation, TurnSimulator
 
 DEFAULT_HORIZON = 10
@@ -95,8 +94,7 @@ class MurseSimulator(TurnSimulator):
         self._allocate(pad, graph.SIMPLIFICATIONS.index(simplification))
         self._link()
         self._loaded: list[MurseInstance | None] = [None] * self.batch
-        self._seeds = np.zeros(self.batch, np.int64)
-        self._episodes = np.full(self.batch, -1, np.int64)
+        self._first_episodes()
         self.reset(seed=seed)
 
     def _allocate(self, pad: str | None, simplification: int) -> None:
@@ -134,19 +132,9 @@ class MurseSimulator(TurnSimulator):
         episodes: Sequence[int] | None = None,
     ) -> None:
         """Start new episodes; see TurnSimulator.reset."""
-        chosen = np.arange(self.batch) if envs is None else np.flatnonzero(envs)
-        for name, given in (("instances", instances), ("episodes", episodes)):
-            if given is not None and len(given) != len(chosen):
-                raise InvalidOptionError(f"{name}: expected one per chosen row ({len(chosen)}), got {len(given)}")
+        chosen = self._next_episodes(envs, seed, instances, episodes)
         for b, instance in zip(chosen, instances or [], strict=False):
             self.instances[b] = self._with_settings(instance)
-        if seed is not None:
-            self._seeds[chosen] = as_seed(seed)
-            self._episodes[chosen] = 0
-        else:
-            self._episodes[chosen] += 1
-        if episodes is not None:
-            self._episodes[chosen] = episodes
         for b in chosen:
             self._load(int(b))
         dynamics.begin_rows(self.state, self.rules, chosen.astype(np.int64))
@@ -162,8 +150,7 @@ class MurseSimulator(TurnSimulator):
                 )
             load_instance(self.state, b, instance, min(instance.n_rounds, self.horizon))
             self._loaded[b] = instance
-        key = episode_key(np.uint64(self._seeds[b]), np.uint64(instance.identity), np.uint64(self._episodes[b]))
-        self.state.rows["episode"][b] = np.uint64(key)
+        self.state.rows["episode"][b] = self._episode_key(b)
 
     def step(self, actions: np.ndarray) -> None:
         """Take one turn in every row; see TurnSimulator.step."""

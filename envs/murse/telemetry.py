@@ -145,7 +145,7 @@ def decode(payload: bytes, kind: type[P]) -> P:
 
 
 class MurseTelemetry:
-    """The world's side, and the way to an agent's; see marl_sched.domain.Telemetry."""
+    """The world's side, and the way to an agent's; see marl_sched.domain_parts.Telemetry."""
 
     time_unit = "time"
 

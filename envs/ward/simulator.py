@@ -11,7 +11,6 @@ from marl_sched.envs.ward.features import GRAPH
 from marl_sched.envs.ward.instance import QUARTERS, SCALES, STAGES, WardInstance
 from marl_sched.envs.ward.views import FullView, View
 from marl_sched.errors import IllegalActionError, InvalidOptionError, require, require_integer
-from marl_sched.noise import as_seed, episode_key
 from marl_sched.simulation import Observation, TurnSimulator
 
 DEFAULT_HORIZON = 24  # hours
@@ -66,7 +65,7 @@ class WardSimulator(TurnSimulator):
         shown = (self.batch, self.rules.end, beds) if record_timeline else (0, 0, 0)
         self.state = new_state(self.batch, patients, self.max_agents, beds, shown)
         self._link()
-        self._seeds, self._episodes = np.zeros(self.batch, np.int64), np.full(self.batch, -1, np.int64)
+        self._first_episodes()
         self.reset(seed=seed)
 
     def _link(self) -> None:
@@ -86,19 +85,10 @@ class WardSimulator(TurnSimulator):
         episodes: Sequence[int] | None = None,
     ) -> None:
         """Start new episodes; see TurnSimulator.reset."""
-        chosen = np.arange(self.batch) if envs is None else np.flatnonzero(envs)
-        for name, given in (("instances", instances), ("episodes", episodes)):
-            if given is not None and len(given) != len(chosen):
-                raise InvalidOptionError(f"{name}: expected one per chosen row ({len(chosen)}), got {len(given)}")
+        chosen = self._next_episodes(envs, seed, instances, episodes)
         if instances is not None:
             for b, instance in zip(chosen, instances, strict=True):
                 self.instances[b] = instance
-        if seed is None:
-            self._episodes[chosen] += 1
-        else:
-            self._seeds[chosen], self._episodes[chosen] = as_seed(seed), 0
-        if episodes is not None:
-            self._episodes[chosen] = episodes
         for b in chosen:
             self._start(int(b))
 
@@ -113,7 +103,7 @@ class WardSimulator(TurnSimulator):
             if len(array):
                 array[b] = np.zeros((), array.dtype)
         row, patients, nurses = state.rows[b], state.patients[b], state.nurses[b]
-        key = episode_key(np.uint64(self._seeds[b]), np.uint64(instance.identity), np.uint64(self._episodes[b]))
+        key = self._episode_key(b)
         row["episode"] = key
         row["n_patients"], row["n_nurses"] = len(instance.patients), len(instance.nurses)
         row["n_beds"] = len(instance.beds)

@@ -99,7 +99,7 @@ def _decode(payload: bytes, kind: type[P]) -> P:
 
 
 class WardTelemetry:
-    """The world's side, and the way to an agent's; see marl_sched.domain.Telemetry."""
+    """The world's side, and the way to an agent's; see marl_sched.domain_parts.Telemetry."""
 
     time_unit = "quarter-hour"
 
@@ -154,7 +154,7 @@ class WardTelemetry:
 
 
 class WardLocalState:
-    """What one nurse knows; see marl_sched.domain.LocalState."""
+    """What one nurse knows; see marl_sched.domain_parts.LocalState."""
 
     def __init__(self, frame: Frame, agent: int) -> None:
         if not 0 <= agent < len(frame.homes):

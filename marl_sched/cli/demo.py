@@ -13,7 +13,8 @@ from marl_sched.errors import DeploymentError, InvalidOptionError
 
 if TYPE_CHECKING:
     from marl_sched.comms.metrics.report import RunReport
-    from marl_sched.domain import Demo, Domain
+    from marl_sched.domain import Domain
+    from marl_sched.domain_parts import Demo
     from marl_sched.problem import Problem
     from marl_sched.simulation import TurnSimulator
     from marl_sched.train.evaluation.results import Results

@@ -13,7 +13,8 @@ from marl_sched.cli.grouped import DOMAIN_OPTIONS, OwnOptions, takes_own
 from marl_sched.errors import InvalidFileError, InvalidOptionError, UnknownNameError
 
 if TYPE_CHECKING:
-    from marl_sched.domain import Domain, Instance
+    from marl_sched.domain import Domain
+    from marl_sched.domain_parts import Instance
     from marl_sched.sheets import Sheet
 
 ROWS, RECORDS = "rows", "records"

@@ -61,8 +61,13 @@ def played_in_aec(given: WorldOptions, policies: list[str]) -> list[int]:
 
 
 @pytest.mark.parametrize("view", ["full", LOCAL], ids=["full", "local"])
-def test_run_equals_the_aec_environment_for_twenty_seeds(view):
-    for seed in range(20):
+@pytest.mark.parametrize(
+    "seeds",
+    [range(2), pytest.param(range(2, 20), marks=pytest.mark.slow)],
+    ids=["two seeds", "eighteen more"],
+)
+def test_run_equals_the_aec_environment(view, seeds):
+    for seed in seeds:
         given = options(seed=seed, view=view)
         policies = ["random", "edf", *["random"] * (n_agents(given) - 2)]
         report = play(given, policies)

@@ -181,6 +181,7 @@ def test_bound_is_convex_in_the_prices() -> None:
         assert middle <= (relaxation.bounds(a)[0] + relaxation.bounds(b)[0]) / 2 + 1e-12
 
 
+@pytest.mark.slow
 def test_minimising_lowers_the_bound_and_fewer_income_nodes_raise_it() -> None:
     relaxation = Relaxation([generate("small", np.random.default_rng(1))], horizon=100)
     prices = relaxation.minimise(evaluations=10)

@@ -10,7 +10,7 @@ import numpy as np
 from couriers import graph
 from couriers.instance import SCALES, CouriersInstance
 from marl_sched.errors import IllegalActionError, InvalidOptionError, require, require_integer
-from marl_sched.noise import FIRST_DOMAIN_STREAM, as_seed, episode_key, time_key, uniform
+from marl_sched.noise import FIRST_DOMAIN_STREAM, time_key, uniform
 from marl_sched.simulation import Observation, TurnSimulator
 
 OBJECTIVES = ("waiting", "travel")
@@ -65,7 +65,7 @@ class CouriersSimulator(TurnSimulator):
         self.history: list[list[tuple[int, int, int]]] = [[] for _ in instances]  # (courier, day, days), for pictures
         for name, dtype in _PER_ENV.items():
             setattr(self, name, np.zeros(self.batch, dtype))
-        self._seeds, self._episodes = np.zeros(self.batch, np.int64), np.full(self.batch, -1, np.int64)
+        self._first_episodes()
         self.reset(seed=seed)
 
     def reset(
@@ -77,16 +77,7 @@ class CouriersSimulator(TurnSimulator):
         episodes: Sequence[int] | None = None,
     ) -> None:
         """Start new episodes; see TurnSimulator.reset."""
-        chosen = np.arange(self.batch) if envs is None else np.flatnonzero(envs)
-        for name, given in (("instances", instances), ("episodes", episodes)):
-            if given is not None and len(given) != len(chosen):
-                raise InvalidOptionError(f"{name}: expected one per chosen env ({len(chosen)}), got {len(given)}")
-        if seed is None:
-            self._episodes[chosen] += 1
-        else:
-            self._seeds[chosen], self._episodes[chosen] = as_seed(seed), 0
-        if episodes is not None:
-            self._episodes[chosen] = episodes
+        chosen = self._next_episodes(envs, seed, instances, episodes)
         for k, b in enumerate(chosen):
             if instances is not None:
                 self.instances[b] = instances[k]
@@ -101,7 +92,7 @@ class CouriersSimulator(TurnSimulator):
         for name in _PER_ENV:
             getattr(self, name)[b] = 0
         self.history[b] = []
-        key = episode_key(np.uint64(self._seeds[b]), np.uint64(instance.identity), np.uint64(self._episodes[b]))
+        key = self._episode_key(b)
         self.episode_keys[b], self.n_agents[b] = np.uint64(key), len(instance.couriers)
         for c, courier in enumerate(instance.couriers):
             self.couriers[b, c]["there"], self.couriers[b, c]["home"] = True, courier.home

@@ -35,7 +35,7 @@ class Said(msgspec.Struct, tag="couriers.state.1", forbid_unknown_fields=True):
 
 
 class CouriersTelemetry:
-    """The world's side, and the way to an agent's; see marl_sched.domain.Telemetry."""
+    """The world's side, and the way to an agent's; see marl_sched.domain_parts.Telemetry."""
 
     time_unit = "day"
 
@@ -78,7 +78,7 @@ class CouriersTelemetry:
 
 
 class CouriersLocalState:
-    """What one courier knows; see marl_sched.domain.LocalState."""
+    """What one courier knows; see marl_sched.domain_parts.LocalState."""
 
     def __init__(self, frame: Frame, agent: int) -> None:
         if not 0 <= agent < len(frame.homes):
