@@ -1,8 +1,9 @@
-"""The run's log: one JSON line for the problem, then one for every commit; appended, never changed.
+"""The run's log: one JSON line for the problem, then one for every commit and every order; appended, never changed.
 
 A world that is restarted with the log of its run plays the commits again, holds their outcomes and rewards against
-what was written down, and goes on from there. `marl-sched replay` does the same and stops at the end. A last line
-that was cut off is not a commit: nobody was told of it before it stood in the log.
+what was written down, lets the orders hold that it had accepted, and goes on from there. `marl-sched replay` does the
+same and stops at the end. A last line that was cut off is not a commit: nobody was told of it before it stood in the
+log.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import msgspec
 
 from marl_sched.comms.plant import Commit, Plant
 from marl_sched.comms.protocol.events import Choice, Outcome
+from marl_sched.comms.protocol.messages import Operator, Team, Work
 from marl_sched.errors import InvalidFileError
 
 if TYPE_CHECKING:
@@ -74,14 +76,20 @@ class Step(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     sources: list[str] = []
 
 
-Line = Header | Resumed | Step
+class Accepted(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="order"):
+    """An operator's order that holds from here on."""
+
+    order: Team | Work | Operator
+
+
+Line = Header | Resumed | Step | Accepted
 _encoder, _decoder = msgspec.json.Encoder(), msgspec.json.Decoder(Line)
 
 
 class CommitLog(Protocol):
     """Where commits are kept."""
 
-    def append(self, line: Resumed | Step) -> None:
+    def append(self, line: Resumed | Step | Accepted) -> None:
         """Keep a line before anybody is told of it."""
 
     def commits(self) -> Iterator[Commit]:
@@ -92,9 +100,9 @@ class CommitLog(Protocol):
 class MemoryLog:
     """Commits of a run that nobody continues."""
 
-    lines: list[Resumed | Step] = field(default_factory=list)
+    lines: list[Resumed | Step | Accepted] = field(default_factory=list)
 
-    def append(self, line: Resumed | Step) -> None:
+    def append(self, line: Resumed | Step | Accepted) -> None:
         """See CommitLog.append."""
         self.lines.append(line)
 
@@ -124,7 +132,7 @@ class FileLog:
         if not lines:
             self._write(header)
 
-    def append(self, line: Resumed | Step) -> None:
+    def append(self, line: Resumed | Step | Accepted) -> None:
         """See CommitLog.append."""
         self._write(line)
 
@@ -138,13 +146,23 @@ class FileLog:
         """See CommitLog.commits."""
         return (commit for line in read_log(self.path) if isinstance(line, Step) for commit in line.commits)
 
-    def steps(self) -> Iterator[Step]:
-        """What was applied at once, in order."""
-        return (line for line in read_log(self.path) if isinstance(line, Step))
+    def played(self) -> list[Step | Accepted]:
+        """What was applied at once and what was ordered, in order."""
+        return played(read_log(self.path))
 
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+
+
+def played(lines: Iterable[Line]) -> list[Step | Accepted]:
+    """The lines of a log that change the plant or bind the team."""
+    return [line for line in lines if isinstance(line, Step | Accepted)]
+
+
+def team_orders(lines: Iterable[Step | Accepted]) -> list[Team]:
+    """The orders about the team, in order."""
+    return [line.order for line in lines if isinstance(line, Accepted) and isinstance(line.order, Team)]
 
 
 def read_log(path: Path) -> list[Line]:
@@ -180,15 +198,23 @@ def _difference(found: Line, expected: Header) -> str:
     return ", ".join(f"{name} {was!r} instead of {now!r}" for name, (was, now) in pairs.items() if was != now)
 
 
-def play_again(plant: Plant, steps: Iterable[Step], path: Path) -> int:
-    """Apply logged commits to a fresh plant; how many there were. InvalidFileError where they come out otherwise."""
+def play_again(plant: Plant, lines: Iterable[Step | Accepted], path: Path) -> int:
+    """Apply logged commits and orders to a fresh plant; how many commits there were.
+
+    Orders about the team are not the plant's. InvalidFileError where a line comes out otherwise.
+    """
     count = 0
-    for step in steps:
+    for line in lines:
+        if isinstance(line, Accepted):
+            reason = None if isinstance(line.order, Team) else plant.order(line.order)
+            if reason is not None:
+                raise InvalidFileError(path, f"order {line.order.request}", f"accepted, not: {reason}", line.order.kind)
+            continue
         choices = [
-            Choice(c.agent, c.action, c.outcome if c.outcome in _FORCED else Outcome.DECIDED) for c in step.commits
+            Choice(c.agent, c.action, c.outcome if c.outcome in _FORCED else Outcome.DECIDED) for c in line.commits
         ]
         again = plant.apply(choices)
-        if again != step.commits:
-            raise InvalidFileError(path, f"commit {count + 1}", f"what this version plays: {again}", step.commits)
+        if again != line.commits:
+            raise InvalidFileError(path, f"commit {count + 1}", f"what this version plays: {again}", line.commits)
         count += len(again)
     return count

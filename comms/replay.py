@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 
-from marl_sched.comms.decision_log import SCHEMA, Header, Step, play_again, read_log
+from marl_sched.comms.decision_log import SCHEMA, Header, Step, play_again, played, read_log
 from marl_sched.comms.metrics.report import RunReport, build_report
 from marl_sched.comms.metrics.run_metrics import RunMetrics
 from marl_sched.comms.options import Conflict, WorldOptions
@@ -40,7 +40,7 @@ def replay(path: Path, picture: Path | None = None) -> RunReport:
         raise InvalidFileError(path, "plant", "the simulated one, which can be played again", header.plant)
     plant = options.simulated_plant(**extra)
     steps = [line for line in lines if isinstance(line, Step)]
-    play_again(plant, steps, path)
+    play_again(plant, played(lines), path)
     if picture is not None:
         _draw(picture, domain.render[PICTURE](plant.simulator, 0))
     over = bool(plant.simulator.over[0])

@@ -16,7 +16,17 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
-from marl_sched.comms.decision_log import CommitLog, FileLog, Header, MemoryLog, Resumed, Step, play_again
+from marl_sched.comms.decision_log import (
+    Accepted,
+    CommitLog,
+    FileLog,
+    Header,
+    MemoryLog,
+    Resumed,
+    Step,
+    play_again,
+    team_orders,
+)
 from marl_sched.comms.logs import set_up_logs
 from marl_sched.comms.metrics.report import RunReport, build_report
 from marl_sched.comms.metrics.run_metrics import RunMetrics
@@ -82,9 +92,10 @@ class World:
         self.epoch = f"{time.time_ns():x}-{os.getpid():x}"
         self.commits = commits if commits is not None else MemoryLog()
         resumed = isinstance(self.commits, FileLog) and self.commits.resumed
+        earlier = self.commits.played() if isinstance(self.commits, FileLog) else []
         if isinstance(self.commits, FileLog) and resumed:
             if self.plant.simulated:
-                play_again(self.plant, self.commits.steps(), self.commits.path)
+                play_again(self.plant, earlier, self.commits.path)
             self.commits.append(Resumed(epoch=self.epoch))
         self.protocol = WorldProtocol(
             options.rules(),
@@ -96,6 +107,7 @@ class World:
             channels=self.plant.channels,
             now=clock(),
             resumed=resumed,
+            orders=team_orders(earlier),
         )
         self._keys = keys.AgentKeys(self.domain.agent_prefix)
         self._warnings = ThrottledLog(log)
@@ -181,8 +193,13 @@ class World:
                     self.metrics.note_sent("world/answer", payload)
                     self.transport.reply(query, payload)
                 case ev.Order(query, order):
-                    answer = ev.Ordered(query, order.request, self.plant.order(order))
+                    reason = self.plant.order(order)
+                    if reason is None:
+                        self.commits.append(Accepted(order=order))
+                    answer = ev.Ordered(query, order.request, reason)
                     self._perform(self.protocol.handle(answer, self._clock()))
+                case ev.Keep(order):
+                    self.commits.append(Accepted(order=order))
                 case ev.Apply(choices):
                     self._apply(choices)
                 case ev.Note():

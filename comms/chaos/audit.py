@@ -6,13 +6,12 @@ from collections import Counter
 from pathlib import Path
 
 from marl_sched.agents.registry import create_scheduler
-from marl_sched.comms.decision_log import Step, read_log
+from marl_sched.comms.decision_log import Accepted, Step, play_again, played, read_log
 from marl_sched.comms.metrics.report import RunReport
 from marl_sched.comms.options import WorldOptions
 from marl_sched.comms.plant import IDLE
-from marl_sched.comms.protocol.events import Choice, Outcome
-
-FORCED = (Outcome.LATE, Outcome.ABSENT)
+from marl_sched.comms.protocol.events import Outcome
+from marl_sched.errors import InvalidFileError
 
 
 def violations(world: WorldOptions, log: Path, before: bytes, report: RunReport) -> list[str]:
@@ -23,7 +22,7 @@ def violations(world: WorldOptions, log: Path, before: bytes, report: RunReport)
     """
     lines = read_log(log)
     steps = [line for line in lines if isinstance(line, Step)]
-    found = _order(world, steps) + _owners(steps)
+    found = _order(world, log, played(lines)) + _owners(steps)
     sources = Counter(source for step in steps for source in step.sources if source)
     found += [f"decision {source} was applied {n} times" for source, n in sources.items() if n > 1]
     if not log.read_bytes().startswith(before):
@@ -36,15 +35,12 @@ def violations(world: WorldOptions, log: Path, before: bytes, report: RunReport)
     return found
 
 
-def _order(world: WorldOptions, steps: list[Step]) -> list[str]:
+def _order(world: WorldOptions, log: Path, lines: list[Step | Accepted]) -> list[str]:
     """Each step must be the turns of those whose turn it was, and come out as it is written down."""
-    plant = world.plant()
-    for number, step in enumerate(steps, 1):
-        choices = [
-            Choice(c.agent, c.action, c.outcome if c.outcome in FORCED else Outcome.DECIDED) for c in step.commits
-        ]
-        if plant.apply(choices) != step.commits:
-            return [f"step {number}: played again it comes out otherwise"]
+    try:
+        play_again(world.plant(), lines, log)
+    except InvalidFileError as error:
+        return [f"played again it comes out otherwise: {error}"[:400]]
     return []
 
 

@@ -36,8 +36,15 @@ class Commands:
         if order.run != self._run or order.epoch not in ("", self._epoch):
             return [ev.Count("other_epoch"), self.answer(event.query, order.request, "it is to another run or epoch")]
         if isinstance(order, wire.Team):
-            return [self.answer(event.query, order.request, self._team(order, now))]
+            reason = self._team(order, now)
+            kept: list[ev.Effect] = [ev.Keep(order)] if reason is None else []
+            return [*kept, self.answer(event.query, order.request, reason)]
         return [ev.Order(event.query, order)]
+
+    def restore(self, order: wire.Team, now: float) -> None:
+        """Let an order hold that an earlier epoch of the world took; barred agents are not among what it left."""
+        if order.kind != "readmit" or order.agent in self.drained:
+            self._team(order, now)
 
     def answer(self, query: int, request: str, reason: str | None) -> ev.Reply:
         """That an order is accepted, or why not."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 
-from marl_sched.comms.protocol.messages import Message, Operator, Turn, Work
+from marl_sched.comms.protocol.messages import Message, Operator, Team, Turn, Work
 
 
 class ExitCode(IntEnum):
@@ -196,6 +196,13 @@ class Order:
 
 
 @dataclass(frozen=True, slots=True)
+class Keep:
+    """Write down an order about the team that holds from now on, before anybody is told."""
+
+    order: Team
+
+
+@dataclass(frozen=True, slots=True)
 class Apply:
     """Commit these choices to the plant; PlantAdvanced follows."""
 
@@ -297,6 +304,7 @@ Effect = (
     | Reply
     | Apply
     | Order
+    | Keep
     | Note
     | Count
     | Warn

@@ -58,8 +58,12 @@ class WorldProtocol:
         channels: Sequence[Sequence[str]],
         now: float,
         resumed: bool = False,
+        orders: Sequence[wire.Team] = (),
     ) -> None:
-        """`channels` are those that each agent may hear; `resumed`: the run has been played in part before."""
+        """`channels` are those that each agent may hear; `resumed`: the run has been played in part before.
+
+        `orders` about the team were taken by earlier epochs, in this order, and hold.
+        """
         self.rules = rules
         self.phase: wire.Phase = "gathering"
         self.members = Membership(len(channels), rules.patience, rules.bar)
@@ -77,6 +81,8 @@ class WorldProtocol:
         self._farewell_by, self._poll_at = math.inf, -math.inf
         self._slots_seen, self._slots_due_at = -1, math.inf
         self._commands = Commands(self.members, run, epoch, now)
+        for order in orders:
+            self._commands.restore(order, now)
         self._reception = Reception(self.members, self._keys, run, epoch)
         self._answers = Answers(
             wire.Frame(run=run, epoch=epoch, env=env, agents=len(channels), heartbeat=rules.heartbeat, problem=frame),

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import time
+import uuid
+
 import pytest
 
 from marl_sched.comms import orders
+from marl_sched.comms.decision_log import FileLog, Header
 from marl_sched.comms.inproc import Bus, Threads
 from marl_sched.comms.options import WorldOptions
+from marl_sched.comms.plant import SimulatedPlant
 from marl_sched.comms.protocol import events as ev
 from marl_sched.comms.protocol import keys
 from marl_sched.comms.protocol import messages as wire
 from marl_sched.comms.protocol.commands import WORDS
-from marl_sched.errors import DeploymentError, InvalidOptionError, UnknownNameError
+from marl_sched.comms.replay import replay
+from marl_sched.comms.world import World
+from marl_sched.errors import DeploymentError, InvalidFileError, InvalidOptionError, UnknownNameError
 from marl_sched.problem import Problem
 from tests.comms.driver import US, WorldDriver, of, turns
 
@@ -98,6 +105,79 @@ def test_order_reaches_the_plant_and_its_answer_the_operator():
     operator.ask(1, keys.COMMAND, wire.encode(orders.order_of("run", "cancel", entity="plane/3")))
     run.world._turn_once()
     assert wire.decode(operator.receive(0).payload, wire.Declined).reason == "airme cannot cancel work while it runs"
+
+
+class Workshop(SimulatedPlant):
+    """A plant that cancels work; `cancelled` are (hour, entity)."""
+
+    def __init__(self, options: WorldOptions) -> None:
+        super().__init__(options.domain, options.telemetry(), options.simulator())
+        self.cancelled: list[tuple[int, str]] = []
+
+    def order(self, order: wire.Work | wire.Operator) -> str | None:
+        if order.kind != "cancel":
+            return super().order(order)
+        self.cancelled.append((int(self.simulator.time[0]), order.entity))
+        return None
+
+
+def test_restarted_world_plays_accepted_orders_again_where_they_were_given(tmp_path):
+    """The second life of a world whose log holds a cancelled job between its commits, and a drained agent."""
+    options = WorldOptions(problem=Problem("airme", count=1, horizon=40))
+    plant, path = Workshop(options), tmp_path / "run.jsonl"
+    log = FileLog(path, Header.of(options))
+    bus = Bus()
+    world, operator = World(options, bus.node(), plant=plant, commits=log), bus.node()
+    world._open()
+    for _ in range(12):
+        agent = plant.state().requests[0].agent
+        world._perform([ev.Apply((ev.Choice(agent, 0, ev.Outcome.DECIDED, 0.0, "a/1"),))])
+    hour = int(plant.simulator.time[0])
+    assert hour > 0
+    for kind, fields in (("cancel", {"entity": "plane/3"}), ("add", {"entity": "plane/4"}), ("drain", {"agent": 2})):
+        operator.ask(1, keys.COMMAND, wire.encode(orders.order_of("run", kind, **fields)))
+        world._turn_once()
+    agent = plant.state().requests[0].agent
+    world._perform([ev.Apply((ev.Choice(agent, 0, ev.Outcome.DECIDED, 0.0, "a/1"),))])
+    log.close()
+
+    again = Workshop(options)
+    second = World(options, Bus().node(), plant=again, commits=FileLog(path, Header.of(options)))
+    assert again.cancelled == plant.cancelled == [(hour, "plane/3")]
+    assert second.protocol._commands.drained == {2}
+    with pytest.raises(InvalidFileError, match="accepted, not: airme cannot cancel work"):
+        replay(path)  # by a simulator that cannot do it
+
+
+@pytest.mark.slow
+def test_operator_pauses_and_resumes_a_live_world_by_its_certificate(tmp_path):
+    pytest.importorskip("zenoh")
+    from marl_sched.comms.launcher import Deployment
+    from marl_sched.comms.options import DeployOptions
+    from marl_sched.comms.security.certificates import make_certificates
+
+    make_certificates(tmp_path / "certs", [f"crew_{i}" for i in range(7)])
+    world = WorldOptions(
+        problem=Problem("airme", count=1, horizon=200), run=f"test-{uuid.uuid4().hex[:12]}", listen="tls/127.0.0.1:0",
+        certs=str(tmp_path / "certs"), deadline=30.0, ready_timeout=120.0, standstill=120.0, grace=60.0, clock="paced",
+        pace=0.01,
+    )  # fmt: skip
+    with Deployment(DeployOptions(world=world, policy="random", runtime="onnx")) as deployment:
+
+        def until(phase: str) -> None:
+            end = time.monotonic() + 120
+            while deployment.phase != phase:
+                assert time.monotonic() < end, deployment.phase
+                deployment.look(0.05)
+
+        until("running")
+        for kind, phase in (("pause", "standstill"), ("resume", "running")):
+            orders.send(orders.order_of(world.run, kind), deployment.endpoint, world.certs, 30.0)
+            until(phase)
+        with pytest.raises(DeploymentError, match="the world declines: airme cannot hold an agent's choices"):
+            orders.send(orders.order_of(world.run, "hold", agent=1), deployment.endpoint, world.certs, 30.0)
+        report = deployment.wait()
+    assert report.ending.kind == "complete"
 
 
 def test_order_that_is_none_is_refused_before_it_is_sent():
