@@ -9,6 +9,7 @@ import numpy as np
 
 from marl_sched.agents.base import ObservationScheduler, Scheduler
 from marl_sched.agents.light import create_light_scheduler
+from marl_sched.agents.local_rule import LocalRule
 from marl_sched.agents.policies.trained import Runtime
 from marl_sched.agents.recurrent import LocalAgent, RecurrentScheduler
 from marl_sched.agents.registry import create_scheduler
@@ -103,6 +104,25 @@ class PolicyDecider:
         LocalAgent(self._policy).choose(state.observe(), 0.5)
 
 
+class LocalRuleDecider:
+    """Decides by a rule on what the agent was told; see Decider."""
+
+    def __init__(self, rule: LocalRule) -> None:
+        self._rule = rule
+
+    def choose(self, state: LocalState, noise: float) -> tuple[int, int | None]:
+        """See Decider.choose."""
+        return self._rule.choose_locally(state), None
+
+    def forget(self) -> bool:
+        """See Decider.forget."""
+        return False
+
+    def rehearse(self, state: LocalState) -> None:
+        """See Decider.rehearse."""
+        self._rule.choose_locally(state)
+
+
 class PlanDecider:
     """Plans for the whole team, each agent for itself, on what it was told as a simulator; see Decider."""
 
@@ -138,6 +158,8 @@ def decider_of(policy: str, domain: Domain | LightDomain, runtime: Runtime = "to
     scheduler = create_scheduler(policy, domain, runtime=runtime)
     if isinstance(scheduler, ObservationScheduler | RecurrentScheduler):
         return PolicyDecider(scheduler)
+    if isinstance(scheduler, LocalRule):
+        return LocalRuleDecider(scheduler)
     if scheduler.plans_on_estimates:
         return PlanDecider(scheduler)
     raise InvalidOptionError(f"{policy} needs more than an agent is told and cannot be deployed")

@@ -7,9 +7,12 @@ It knows the whole problem on the durations that the team counts on.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, cast
+
 import numpy as np
 
-from marl_sched.agents.base import CostScheduler, Scheduler
+from marl_sched.agents.base import CostScheduler
+from marl_sched.agents.local_rule import LocalRule
 from marl_sched.agents.murse.lst import MARGIN, require_margin
 from marl_sched.agents.murse.snapshot import as_murse
 from marl_sched.envs.murse.dynamics import IDLE_AFTER_CONFLICT
@@ -29,6 +32,10 @@ from marl_sched.envs.murse.views import EVERYWHERE, Sight, new_sight, survey
 from marl_sched.kernels import kernel
 from marl_sched.privileged import PrivilegedInfo
 from marl_sched.simulation import TurnSimulator
+
+if TYPE_CHECKING:
+    from marl_sched.domain import LocalState
+    from marl_sched.envs.murse.local_state import MurseLocalState
 
 CHARGES = np.array([0.0, 2.0])
 LATE_CHARGE = 2.0  # of a unit of lateness, in units of makespan
@@ -147,7 +154,16 @@ def choices_by_rule(
             targets[b] = rule_target(state, b, viewer, count, outlook)
 
 
-class LocalLst(Scheduler):
+@kernel
+def choice_on_sight(state: State, viewer: int, sight: Sight, margin: float, targets: np.ndarray) -> None:
+    """Write what the rule has an agent do, int64 (1,), that was told `sight` of the only row."""
+    outlook = new_outlook(state)
+    for b in range(len(targets)):  # not a literal 0, for which everything would be compiled again
+        count = work_out(state, b, sight, margin, outlook)
+        targets[b] = rule_target(state, b, viewer, count, outlook)
+
+
+class LocalLst(LocalRule):
     """The latest-start rule run by every agent by itself, whenever it decides, on what it sees under its view.
 
     Raises InvalidOptionError for a negative margin, of which so many standard deviations are added to durations.
@@ -163,6 +179,12 @@ class LocalLst(Scheduler):
         murse, targets = as_murse(simulator), np.zeros(simulator.batch, np.int64)
         choices_by_rule(murse.state, murse.rules, *murse.view.limits, self._margin, targets)
         return targets
+
+    def choose_locally(self, known: LocalState) -> int:
+        """One agent's target on what it was told."""
+        told, targets = cast("MurseLocalState", known), np.zeros(1, np.int64)
+        choice_on_sight(told.state, told.agent, told.sight, self._margin, targets)
+        return int(targets[0])
 
 
 class RobustLocalLst(LocalLst):

@@ -165,10 +165,26 @@ class Membership:
         self.slots = [Slot(moves=self.moves) for _ in range(n_agents)]
         self._patience, self._bar = patience, bar
         self._counted_at, self._staying, self._present = -1, 0, 0
+        self._looked_at, self._due = -1, math.inf
 
     def absent(self) -> list[int]:
         """Agents that nobody speaks for, but for those that left."""
         return [i for i, slot in enumerate(self.slots) if not slot.present and slot.state != SlotState.LEFT]
+
+    def due(self, unheard: float) -> float:
+        """When a slot may have to be looked at, at the earliest; hearing an agent only makes it later.
+
+        With a hundred agents, looking at all slots at every event would be most of what an event costs.
+        """
+        if self._looked_at != self.moves.all:
+            self._looked_at = self.moves.all
+            ready = (slot.heard_at + unheard for slot in self.slots if slot.state == SlotState.READY)
+            self._due = min([*(slot.until for slot in self.slots), *ready])
+        return self._due
+
+    def look_again(self) -> None:
+        """Work out anew when a slot is due, though none has moved."""
+        self._looked_at = -1
 
     def quorate(self, quorum: float) -> bool:
         """Whether at least the share `quorum` of the agents that have not left is present, one at least."""

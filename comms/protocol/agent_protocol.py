@@ -63,8 +63,7 @@ class AgentProtocol:
         self.ended: ev.End | None = None
         self.subscriptions: set[str] = set()
         self._run, self._agent, self._policy, self._identity, self._mind = run, agent, policy, identity, mind
-        self._epoch, self._heartbeat, self._tick = "", 0.5, 0
-        self._keys = keys.AgentKeys("agent")
+        self._epoch, self._heartbeat, self._tick, self._keys = "", 0.5, 0, keys.AgentKeys("agent")
         self._versions: dict[str, int] = {}
         self._turn: wire.Turn | None = None  # the one to answer, once the local state is up to date
         self._choosing: wire.Turn | None = None
@@ -102,7 +101,7 @@ class AgentProtocol:
 
     @property
     def attentive(self) -> bool:
-        """Whether the state of a channel matters now; if not, it may wait unread until the next turn or wake-up."""
+        """Whether states matter now; if not, they may wait unread until the next turn or wake-up."""
         return self._turn is not None
 
     def _notice_sleep(self, now: float) -> None:

@@ -53,6 +53,17 @@ class Reception:
             self.fence(agent, said.incarnation, "other_epoch", now, out)
         return None
 
+    def read_token(self, key: str, out: list[ev.Effect]) -> tuple[int, str] | None:
+        """The agent and the incarnation whose token a key is, None for any other, which is counted."""
+        try:
+            agent, leaf, incarnation = self._keys.parse(key)
+            if leaf != "alive" or agent >= len(self._members.slots):
+                raise InvalidMessageError(f"{key}: not the token of an agent of this run")
+        except InvalidMessageError as error:
+            out += [ev.Count("unparsed"), ev.Warn("unparsed", f"dropped a token: {error}")]
+            return None
+        return agent, incarnation
+
     def _tell_other_version(self, agent: int, payload: bytes, now: float, out: list[ev.Effect]) -> None:
         version = wire.other_version(payload, wire.Hello, wire.Beat, wire.Decision)
         if version is None or not self._may_refuse(agent, now):

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from marl_sched.comms.membership.slots import Membership, Slot, SlotEvent, SlotState
 from marl_sched.comms.protocol import events as ev
@@ -18,22 +17,10 @@ from marl_sched.comms.protocol.answers import Answers
 from marl_sched.comms.protocol.commands import Commands
 from marl_sched.comms.protocol.reception import Reception
 from marl_sched.comms.protocol.rules import WorldRules
-from marl_sched.errors import InvalidMessageError
+from marl_sched.comms.protocol.timing import OpenTurn, RunTimes
 
 IDLE = 0
 RECOVERY = 3.0  # seconds that agents have to be heard again after the world itself has slept: lease and reconnection
-
-
-@dataclass
-class OpenTurn:
-    """A decision that the plant asks for. `turn` is None while nobody can be asked."""
-
-    request: ev.Request
-    turn: wire.Turn | None = None
-    asked_at: float = 0.0
-    deadline: float = math.inf
-    resend_at: float = math.inf
-    give_up_at: float = math.inf  # however often its agent goes missing and returns
 
 
 class WorldProtocol:
@@ -73,13 +60,9 @@ class WorldProtocol:
         self._news: dict[str, wire.News] = {}
         self._open: dict[int, OpenTurn] = {}  # in the order in which the plant asks
         self._choices: dict[int, ev.Choice] = {}
-        self._tick, self._first_tick = 0, 0
+        self._tick = 0
         self._applying = self._over = False
-        self._paced_from, self._held_until, self._tick_end = 0.0, -math.inf, math.inf
-        self._last, self._forgiving_until = now, -math.inf
-        self._ready_by, self._clock_at, self._standing_since = now + rules.ready, now, math.inf
-        self._farewell_by, self._poll_at = math.inf, -math.inf
-        self._slots_seen, self._slots_due_at = -1, math.inf
+        self._times, self._last = RunTimes(rules, ready_by=now + rules.ready, clock_at=now), now
         self._commands = Commands(self.members, run, epoch, now)
         for order in orders:
             self._commands.restore(order, now)
@@ -121,22 +104,16 @@ class WorldProtocol:
         if slept <= self.rules.slept:
             return
         self._move_deadlines(slept, now)
-        self._forgiving_until = now + max(RECOVERY, self.rules.grace)
+        self._times.forgiving_until = now + max(RECOVERY, self.rules.grace)
         out.append(ev.Note(-1, "slept", slept))
 
     def _move_deadlines(self, slept: float, now: float) -> None:
         for turn in self._open.values():
-            turn.deadline, turn.give_up_at = turn.deadline + slept, turn.give_up_at + slept
-            turn.asked_at += slept
-            turn.resend_at = min(turn.resend_at, now)
+            turn.move(slept, now)
         for slot in self.members.slots:
             slot.until, slot.heard_at = slot.until + slept, now
-        self._slots_seen = -1
-        self._ready_by += slept
-        self._standing_since += slept
-        self._paced_from += slept
-        self._held_until += slept
-        self._tick_end += slept
+        self.members.look_again()
+        self._times.move(slept)
 
     def _command(self, event: ev.Queried, now: float, out: list[ev.Effect]) -> None:
         """Take an order; a pause that ends was nobody's fault, so all deadlines move."""
@@ -153,15 +130,15 @@ class WorldProtocol:
             return
         if now >= self._slots_due():
             self._watch_slots(now, out)
-            self._slots_seen = -1
+            self.members.look_again()
         if self.phase == "over":
-            if now >= self._farewell_by or not any(slot.present for slot in self.members.slots):
+            if now >= self._times.farewell_by or not any(slot.present for slot in self.members.slots):
                 self._end(out)
         elif self.phase == "gathering":
             self._gather(now, out)
         else:
             self._play(now, out)
-        if now >= self._clock_at and self.ended is None:
+        if now >= self._times.clock_at and self.ended is None:
             self._tell_clock(now, out)
 
     def _watch_slots(self, now: float, out: list[ev.Effect]) -> None:
@@ -175,23 +152,17 @@ class WorldProtocol:
 
     def _tell_clock(self, now: float, out: list[ev.Effect]) -> None:
         beat = min(self.rules.heartbeat, self.rules.resend) if self.phase == "over" else self.rules.heartbeat
-        self._clock_at = now + beat
+        self._times.clock_at = now + beat
         clock = wire.Clock(run=self._run, epoch=self._epoch, tick=self._tick, phase=self.phase)
         out.append(ev.Put(keys.CLOCK, clock))
 
     def _next_wake(self) -> float:
         if self.ended is not None:
             return math.inf
-        times = [self._clock_at, self._farewell_by]
-        if self.phase == "gathering":
-            times.append(self._ready_by)
-        times += [at for at in (self._held_until, self._poll_at) if at > self._last]
-        if self._forgiving_until > self._last:
-            times.append(self._forgiving_until)
-        if self._commands.paused_at is not None:
+        paused = self._commands.paused_at is not None
+        times = self._times.due(self._last, gathering=self.phase == "gathering", paused=paused)
+        if paused:
             return min(*times, self._slots_due())
-        if self._standing_since < math.inf:
-            times.append(self._standing_since + self.rules.standstill)
         for agent, turn in self._open.items():
             if agent not in self._choices:
                 present = self.members.slots[agent].present
@@ -199,25 +170,14 @@ class WorldProtocol:
         return min(*times, self._slots_due())
 
     def _slots_due(self) -> float:
-        """When a slot may have to be looked at, at the earliest; hearing an agent only makes it later.
-
-        With a hundred agents, looking at all slots at every event would be most of what an event costs. When the run is
-        over they are not looked at any more.
-        """
-        if self.phase == "over":
-            return math.inf
-        if self._slots_seen != self.members.moves.all:
-            self._slots_seen = self.members.moves.all
-            due = [slot.until for slot in self.members.slots]
-            due += [s.heard_at + self.rules.unheard for s in self.members.slots if s.state == SlotState.READY]
-            self._slots_due_at = min(due)
-        return self._slots_due_at
+        """When a slot has to be looked at, at the earliest; when the run is over they are not looked at any more."""
+        return math.inf if self.phase == "over" else self.members.due(self.rules.unheard)
 
     # ---- phases
 
     def _gather(self, now: float, out: list[ev.Effect]) -> None:
         missing = self.members.absent()
-        if missing and now < self._ready_by:
+        if missing and now < self._times.ready_by:
             return
         if missing and not (self._resumed and self.members.quorate(self.rules.quorum)):
             names = ", ".join(f"{self._prefix}_{agent}" for agent in missing)
@@ -228,41 +188,36 @@ class WorldProtocol:
             if self.members.slots[agent].state in (SlotState.VACANT, SlotState.MISSING):
                 self._lose(agent, "lost", now, out)
         self.phase = "running"
-        self._paced_from, self._first_tick = now, self._tick
-        self._clock_at = now
-        self._begin_tick()
+        self._times.paced_from, self._times.first_tick = now, self._tick
+        self._times.clock_at = now
+        self._times.begin_tick(self._tick)
         self._play(now, out)
-
-    def _begin_tick(self) -> None:
-        if self.rules.clock == "paced":
-            self._held_until = self._paced_from + (self._tick - self._first_tick) * self.rules.pace
-            self._tick_end = self._held_until + self.rules.pace
 
     def _play(self, now: float, out: list[ev.Effect]) -> None:
         """Ask who can be asked, pass the turns of those who cannot, and apply the choices when all are there."""
-        if self._applying or now < max(self._held_until, self._poll_at):
+        if self._applying or now < max(self._times.held_until, self._times.poll_at):
             return
         if self._over:
             self._finish(ev.End(ev.Ending.COMPLETE), now, out)
             return
         if self._commands.paused_at is not None:
-            if self._standing_since == math.inf:
-                self._standing_since, self.phase, self._clock_at = now, "standstill", now
+            if self._times.standing_since == math.inf:
+                self._times.standing_since, self.phase, self._times.clock_at = now, "standstill", now
             return
         for agent, turn in self._open.items():
             if agent not in self._choices:
                 self._drive(agent, turn, now, out)
         if self._stands_still(now):
-            if self._standing_since == math.inf:
-                self._standing_since, self.phase, self._clock_at = now, "standstill", now
+            if self._times.standing_since == math.inf:
+                self._times.standing_since, self.phase, self._times.clock_at = now, "standstill", now
                 out.append(ev.Note(-1, "standstill"))
-            elif now >= self._standing_since + self.rules.standstill:
+            elif now >= self._times.standing_since + self.rules.standstill:
                 reason = f"fewer agents than the quorum, or one that is missing, for {self.rules.standstill:g} s"
                 self._finish(ev.End(ev.Ending.QUORUM_LOST, reason), now, out)
             return
-        if self._standing_since < math.inf:
-            out.append(ev.Note(-1, "running", now - self._standing_since))
-            self._standing_since, self.phase, self._clock_at = math.inf, "running", now
+        if self._times.standing_since < math.inf:
+            out.append(ev.Note(-1, "running", now - self._times.standing_since))
+            self._times.standing_since, self.phase, self._times.clock_at = math.inf, "running", now
         if len(self._choices) == len(self._open):
             self._applying = True
             out.append(ev.Apply(tuple(self._choices[agent] for agent in self._open)))
@@ -274,7 +229,7 @@ class WorldProtocol:
 
     def _waits_for(self, turn: OpenTurn, now: float) -> bool:
         """Whether time stands still because this turn's agent is missing."""
-        patient = self.rules.clock == "lockstep" or now < self._forgiving_until
+        patient = self.rules.clock == "lockstep" or now < self._times.forgiving_until
         missing = self.members.slots[turn.request.agent].state == SlotState.MISSING
         return patient and missing and now < turn.give_up_at
 
@@ -292,16 +247,14 @@ class WorldProtocol:
             self._choices[agent] = ev.Choice(agent, IDLE, ev.Outcome.ABSENT)
             return
         if turn.turn is None or turn.turn.incarnation != slot.incarnation:
-            if now >= self._tick_end:  # the paced clock has gone past this tick
+            if now >= self._times.tick_end:  # the paced clock has gone past this tick
                 out.append(ev.Count("tick_overruns"))
                 self._choices[agent] = ev.Choice(agent, IDLE, ev.Outcome.LATE)
                 return
             self._ask(agent, slot, turn, now)
         if slot.state == SlotState.READY:
             slot.move(SlotEvent.ASK)
-            turn.give_up_at = min(turn.give_up_at, now + self.rules.deadline + self.rules.grace)
-            turn.deadline = min(now + self.rules.deadline, self._tick_end, turn.give_up_at)
-            turn.asked_at, turn.resend_at = now, now
+            turn.open(now, self.rules, self._times.tick_end)
         if now >= turn.deadline:
             self._late(agent, now - turn.asked_at, now, out)
         elif now >= turn.resend_at and turn.turn is not None:
@@ -338,10 +291,10 @@ class WorldProtocol:
             news = wire.News(run=self._run, epoch=self._epoch, channel=channel, sequence=sequence, payload=payload)
             self._news[channel] = news
             out.append(ev.Put(channel, news))
-        self._poll_at = -math.inf if event.requests or event.over else now + self.rules.poll
+        self._times.poll_at = -math.inf if event.requests or event.over else now + self.rules.poll
         if event.tick != self._tick:
             self._tick = event.tick
-            self._begin_tick()
+            self._times.begin_tick(self._tick)
         self._open = {request.agent: OpenTurn(request) for request in event.requests}
         self._choices, self._applying, self._over = {}, False, event.over
 
@@ -351,8 +304,8 @@ class WorldProtocol:
             return
         self.phase, self._ending = "over", ending
         self._open, self._choices = {}, {}
-        self._held_until, self._standing_since = -math.inf, math.inf
-        self._farewell_by, self._clock_at = now + self.rules.farewell, now
+        self._times.held_until, self._times.standing_since = -math.inf, math.inf
+        self._times.farewell_by, self._times.clock_at = now + self.rules.farewell, now
         if not any(slot.present for slot in self.members.slots):
             self._tell_clock(now, out)
             self._end(out)
@@ -405,13 +358,10 @@ class WorldProtocol:
             out.append(ev.Note(goodbye.agent, "left"))
 
     def _token(self, event: ev.TokenAppeared | ev.TokenVanished, now: float, out: list[ev.Effect]) -> None:
-        try:
-            agent, leaf, incarnation = self._keys.parse(event.key)
-            if leaf != "alive" or agent >= len(self.members.slots):
-                raise InvalidMessageError(f"{event.key}: not the token of an agent of this run")
-        except InvalidMessageError as error:
-            out += [ev.Count("unparsed"), ev.Warn("unparsed", f"dropped a token: {error}")]
+        whose = self._reception.read_token(event.key, out)
+        if whose is None:
             return
+        agent, incarnation = whose
         slot = self.members.slots[agent]
         if isinstance(event, ev.TokenVanished):
             if incarnation in slot.tokens:
@@ -434,8 +384,8 @@ class WorldProtocol:
         turn = self._open.get(agent)
         waited = now - turn.asked_at if turn is not None and self.members.slots[agent].state == SlotState.ASKED else 0.0
         until = now + self.rules.grace
-        if now < self._forgiving_until:
-            until = max(until, self._forgiving_until)
+        if now < self._times.forgiving_until:
+            until = max(until, self._times.forgiving_until)
         self.members.cut(agent, until)
         out.append(ev.Note(agent, why, waited))
 

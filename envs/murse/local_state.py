@@ -15,8 +15,8 @@ import numpy as np
 from marl_sched.envs.murse import graph, observation, telemetry
 from marl_sched.envs.murse.instance import INELIGIBLE, NO_DEADLINE, MurseInstance
 from marl_sched.envs.murse.simulator import MurseSimulator
-from marl_sched.envs.murse.state import NEVER, NOBODY, NOTHING, new_state
-from marl_sched.envs.murse.views import new_sight
+from marl_sched.envs.murse.state import NEVER, NOBODY, NOTHING, State, new_state
+from marl_sched.envs.murse.views import Sight, new_sight
 from marl_sched.errors import InvalidMessageError
 from marl_sched.simulation import Observation
 
@@ -55,6 +55,21 @@ class MurseLocalState:
         written |= self._observation
         self._arrays = graph.Arrays(*[written[name] for name in graph.Arrays._fields])
         self._simulator: MurseSimulator | None = None
+
+    @property
+    def state(self) -> State:
+        """What the agent was told, as a simulator's state of one row."""
+        return self._state
+
+    @property
+    def sight(self) -> Sight:
+        """How much of that it knows now."""
+        return self._sight
+
+    @property
+    def agent(self) -> int:
+        """Its index."""
+        return self._agent
 
     def hear(self, channel: str, payload: bytes) -> None:
         """Take in a channel's newest payload; see LocalState.hear."""

@@ -75,6 +75,16 @@ def test_run_equals_the_aec_environment(view, seeds):
         assert report.ending.kind == "complete"
 
 
+@pytest.mark.parametrize("view", ["full", LOCAL], ids=["full", "local"])
+def test_agents_run_the_latest_start_rule_on_what_they_are_told_as_in_the_simulator(in_process, view):
+    for seed in range(4):
+        given = options(seed=seed, view=view)
+        policies = ["lst-local", *["lst-robust-local"] * (n_agents(given) - 1)]
+        report = play(given, policies).as_json()
+        reference = in_process(given, policies)
+        assert (report["decisions"], report["rewards"]) == (reference["decisions"], reference["rewards"]), seed
+
+
 @pytest.mark.parametrize("policy", ["lst", "lst-robust", "spt"])
 @pytest.mark.parametrize("mode", ["online", "plan"])
 def test_planners_plan_on_what_they_are_told_as_on_the_simulator(in_process, policy, mode):
@@ -108,8 +118,9 @@ def test_scheduler_that_needs_the_noise_and_an_option_that_does_not_exist_are_re
 def test_ten_rounds_of_two_robots_and_two_humans_as_processes_are_replayed_to_their_gantt_chart(tmp_path, in_process):
     pytest.importorskip("matplotlib")
     given = options(horizon=10, seed=two_and_two(), view=LOCAL, listen="tls/127.0.0.1:0", ready_timeout=300.0)
-    report = deploy(DeployOptions(world=given, policy="edf", folder=str(tmp_path / "kept"))).as_json()
-    reference = in_process(given, ["edf"] * 4)
+    kept, others = str(tmp_path / "kept"), {"agent_2": "lst-local", "agent_3": "lst-local"}
+    report = deploy(DeployOptions(world=given, policy="edf", agent_policies=others, folder=kept)).as_json()
+    reference = in_process(given, ["edf", "edf", "lst-local", "lst-local"])
     assert (report["decisions"], report["rewards"]) == (reference["decisions"], reference["rewards"])
     assert report["ending"] == {"kind": "complete", "reason": None, "exit_code": 0}
     assert report["progress"] == len(report["makespan"]) == 10
