@@ -123,7 +123,7 @@ STEPS := env=murse algorithm=explored_steps curriculum=rounds curriculum.start=1
 TRAIN_schedulenet := $(STEPS) policy=schedulenet updates=400 algorithm.instances=16 validation.instances=40 'env.scales=[homogeneous-10-small,$(strip \
 	)heterogeneous-10-small,homogeneous-10-medium,heterogeneous-5-small,heterogeneous-10-medium]'
 TRAIN_robognn := $(STEPS) policy=robognn updates=300 algorithm.instances=12 validation.instances=30 'env.scales=[robots-small]'
-TRAIN_homgnn-10 := $(STEPS) policy=robognn updates=300 algorithm.instances=12 validation.instances=30 'env.scales=[homogeneous-10-small]'
+TRAIN_homgnn-10 := $(STEPS) policy=robognn updates=60 algorithm.instances=12 validation.instances=30 'env.scales=[homogeneous-10-small]'
 SCALES_schedulenet := homogeneous-10-small,homogeneous-10-medium,heterogeneous-10-small,heterogeneous-10-medium
 SCALES_robognn := robots-small,robots-medium
 SCALES_homgnn-10 := homogeneous-10-small,homogeneous-10-medium
