@@ -132,6 +132,28 @@ policy-schedulenet policy-robognn policy-homgnn-10: policy-%: $(INSTALLED)
 	$(call trained,$*,$(TRAIN_$*))
 	$(BIN)/marl-sched export runs/$* $* --out agents/policies/shipped --scales $(SCALES_$*) --episodes 1 --length 1
 
+# Chapter 5: networks that plan whole rounds pair by pair. HybridNet learns first what pairs cost if the rule completes the
+# rest, then by PPO with a greedy rollout baseline (algorithm 4). Each target takes less than half an hour of one core.
+PAIRS := env=murse curriculum=rounds curriculum.start=1 curriculum.stop=1 device=cpu +env.options.durations=deterministic \
+	validation.length=1 validation.baseline=lst
+COSTS_OF_PAIRS := $(PAIRS) algorithm=choice_costs algorithm.criterion=expected_cost algorithm.temperature=0.015 \
+	algorithm.final_temperature=0.002 algorithm.learning_rate=3e-3
+
+policy-hybridnet: $(INSTALLED)
+	$(call trained,hybridnet-costs,$(COSTS_OF_PAIRS) policy=hybridnet 'env.scales=[small,medium]' updates=350 \
+		algorithm.epochs=2 validation.every=50 validation.instances=150)
+	$(call trained,hybridnet,$(PAIRS) algorithm=greedy_rollout policy=hybridnet 'env.scales=[small,medium]' updates=150 \
+		algorithm.learning_rate=3e-4 validation.every=25 validation.instances=150 \
+		start_from=runs/hybridnet-costs/policy.safetensors)
+	$(BIN)/marl-sched export runs/hybridnet hybridnet --out agents/policies/shipped --scales small,medium,large \
+		--episodes 1 --length 1
+
+policy-hetgat-interactive: $(INSTALLED)
+	$(call trained,hetgat-interactive,$(COSTS_OF_PAIRS) policy=hetgat_interactive policy.width=8 policy.heads=2 \
+		'env.scales=[small]' updates=200 validation.every=25 validation.instances=100)
+	$(BIN)/marl-sched export runs/hetgat-interactive hetgat-interactive --out agents/policies/shipped \
+		--scales small,medium,large --episodes 1 --length 1 --instances 40
+
 format: $(INSTALLED) ## sort imports and lay out the code
 	$(BIN)/ruff check --select I --fix .
 	$(BIN)/ruff format .

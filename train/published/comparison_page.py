@@ -9,6 +9,7 @@ import numpy as np
 
 from marl_sched.errors import MarlSchedError
 from marl_sched.statistics import paired_difference
+from marl_sched.train.published.by_round import by_round
 from marl_sched.train.published.comparisons import Cell, Comparison, Comparisons, Entry, Place, places
 
 _NONE = "-"
@@ -46,6 +47,8 @@ def page(plan: Comparisons, cells: Mapping[str, Cell], command: str, *, quick: b
             of_scale = [place for place in wanted if place.comparison is table and place.scale == scale]
             made = {place.entry.label: cells[place.inputs.name] for place in of_scale}
             parts.append(_scale_table(_Scale(table, scale, made, plan.objective)))
+            if table.horizon > 1 and made:
+                parts += [f"By round, feasible and {plan.objective}:", _markdown(*by_round(made))]
         parts += _remarks(table)
     parts += [*_trained(wanted, cells), _revisions(wanted, cells)]
     return "\n\n".join(parts) + "\n"

@@ -6,8 +6,10 @@ from copy import deepcopy
 from pathlib import Path
 
 import pytest
+from msgspec import structs
 
 from marl_sched.errors import InvalidFileError, MarlSchedError
+from marl_sched.train.published.by_round import by_round, shown_rounds
 from marl_sched.train.published.comparison_page import page
 from marl_sched.train.published.comparisons import (
     Cell,
@@ -129,3 +131,12 @@ def test_the_committed_page_is_what_the_committed_cells_give(path: Path):
     plan = as_comparisons(*shipped_list(path.stem))
     told = page(plan, read_cells(RESULTS / path.stem / "cells.jsonl"), COMMAND)
     assert told == path.read_text(encoding="utf-8"), "draw it again: make tables-murse"
+
+
+def test_rounds_of_an_episode_are_told_apart_and_short_instances_count_only_where_they_have_a_round(plan):
+    """Of two instances the second has one round: 1 of 2 feasible and mean 150 in the first, 90 in the second."""
+    cell = next(iter(cells(plan).values()))
+    played = structs.replace(cell, objective=[[100.0, 90.0], [200.0]], feasible=[[1, 1], [0]])
+    assert by_round({"lst": played}) == (["scheduler", "round 1", "round 2"], [["lst", "50 % 150", "100 % 90"]])
+    assert shown_rounds(10) == [0, 2, 4, 7, 9]
+    assert shown_rounds(1) == [0]
