@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from marl_sched.agents.base import Scheduler
 
 if TYPE_CHECKING:
-    from marl_sched.domain import LocalState
+    from marl_sched.domain_parts import LocalState
 
 
 class LocalRule(Scheduler):

@@ -4,10 +4,10 @@ A forked process is ready in milliseconds and shares the memory of what was impo
 here, as those do not survive a fork. (The standard library's fork server would import the caller's main module into
 every process.)
 
-It takes JSON lines on its standard input: `{"start": NAME, "role": "world" | "agent", "options": {...}, "log": PATH}`
-and `{"signal": NAME, "number": N}`. It gives JSON lines on its standard output: `{"ready": true}`,
-`{"started": NAME, "pid": N}`, `{"ended": NAME, "code": N}`, and what the world says of its progress. It ends with its
-standard input and takes all its processes along; if it is killed they end by themselves.
+It takes JSON lines on its standard input: `{"start": NAME, "role": ROLE, "options": {...}, "log": PATH}`, where the
+role is `world`, `router` or `agent`, and `{"signal": NAME, "number": N}`. It gives JSON lines on its standard output:
+`{"ready": true}`, `{"started": NAME, "pid": N}`, `{"ended": NAME, "code": N}`, and what the world says of its progress.
+It ends with its standard input and takes all its processes along; if it is killed they end by themselves.
 """
 
 from __future__ import annotations
@@ -198,7 +198,7 @@ def main() -> None:
 
 
 def _roles(asked: dict[str, Any]) -> Roles:
-    from marl_sched.comms import agent, world
+    from marl_sched.comms import agent, router, world
     from marl_sched.comms.agent_options import AgentOptions
     from marl_sched.comms.options import WorldOptions
     from marl_sched.comms.transport import zenoh_session  # noqa: F401  (imported once, for all)
@@ -207,6 +207,7 @@ def _roles(asked: dict[str, Any]) -> Roles:
     return {
         "world": (WorldOptions, world.serve, world.exit_code_of),
         "agent": (AgentOptions, agent.run, lambda counts: 0),
+        "router": (WorldOptions, router.route, lambda nothing: 0),
     }
 
 

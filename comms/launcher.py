@@ -15,6 +15,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
+from signal import SIGTERM
 from typing import Any
 
 from msgspec import structs
@@ -25,10 +26,10 @@ from marl_sched.agents.registry import create_scheduler, scheduler_names
 from marl_sched.comms.agent_options import AgentOptions
 from marl_sched.comms.children import BEING_STARTED, LEAVE, Child, ForkServerClient, Said
 from marl_sched.comms.metrics.report import SCHEMA, RunReport
-from marl_sched.comms.options import DeployOptions
+from marl_sched.comms.options import DeployOptions, WorldOptions
 from marl_sched.comms.protocol.events import Ending, ExitCode
 from marl_sched.comms.security.certificates import make_certificates
-from marl_sched.comms.security.identity import WORLD, Identity
+from marl_sched.comms.security.identity import ROUTER, WORLD, Identity
 from marl_sched.comms.stop_signals import stop_signals
 from marl_sched.comms.transport.endpoints import is_encrypted, settle_port
 from marl_sched.domain import Domain
@@ -46,10 +47,11 @@ class Deployment:
     """A running world with its agents; use it as a context manager, which ends all processes.
 
     Attributes:
-        children: "world" or an agent's name -> its process.
+        children: "world", "router_<i>" or an agent's name -> its process.
         phase, tick, horizon: the world's progress, as it last said.
         folder: where the logs, the run's log and the report are.
         certs: the folder of certificates, "" without; one of the run's own exists while it lasts.
+        routers: endpoints of the run's routers, none in a star.
         routes: agent -> the endpoint by which it reaches the world, if not the world's own.
     """
 
@@ -61,7 +63,8 @@ class Deployment:
         self.started_here = options.started_here(self._n_agents)
         for policy in sorted(set(self.policies)):
             _check_policy(policy, options.world.domain, options.runtime)
-        self.endpoint = settle_port(options.world.listen)
+        self.routers = tuple(map(settle_port, options.world.routers))
+        self.endpoint = ",".join(self.routers) or settle_port(options.world.listen)
         self.certs, self.routes = options.world.certs, dict[int, str]()
         if self.certs:
             self._check_certificates(Path(self.certs))
@@ -84,6 +87,8 @@ class Deployment:
                 self.certs = self._own_certs = tempfile.mkdtemp(prefix="marl_sched-certs-")
                 make_certificates(Path(self.certs), [self._name(agent) for agent in range(self._n_agents)])
             self._start_servers()
+            for number, endpoint in enumerate(self.routers):
+                self._add(f"{ROUTER}_{number}", lambda at=endpoint: self._start_router(at))  # type: ignore[misc]  # a bound default
             self._add(WORLD, self.start_world)
             for agent in self.started_here:
                 self._add(self._name(agent), lambda agent=agent: self.start_agent(agent))  # type: ignore[misc]  # a bound default
@@ -100,11 +105,11 @@ class Deployment:
         return self.options.world.domain.agent_name(agent)
 
     def _check_certificates(self, folder: Path) -> None:
-        for name in (WORLD, *(self._name(agent) for agent in self.started_here)):
+        for name in (WORLD, *[ROUTER] * bool(self.routers), *(self._name(agent) for agent in self.started_here)):
             Identity(folder, name)
 
     def _start_servers(self) -> None:
-        world = replace(self.options.world, listen=self.endpoint)
+        world = replace(self.options.world, routers=self.routers)
         policies, runtime = sorted(set(self.policies)), self.options.runtime
         light = runtime == "onnx" and light_domain(world.domain.name) is not None
         self._servers[WORLD] = ForkServerClient(
@@ -126,7 +131,7 @@ class Deployment:
             )
 
     def _server_of(self, name: str) -> ForkServerClient:
-        role = WORLD if name == WORLD else AGENT
+        role = WORLD if name == WORLD or name in self.router_names() else AGENT
         if role not in self._servers:
             raise DeploymentError("the deployment has not been started")
         return self._servers[role]
@@ -139,10 +144,26 @@ class Deployment:
         """Start the world's process; again, if it has died, and then it goes on from its log."""
         self.phase = "starting"
         log = self.options.world.log or str(self.folder / "run.jsonl")
-        options = replace(
-            self.options.world, listen=self.endpoint, report=str(self.report_path), log=log, certs=self.certs
-        )
+        options = replace(self._world(), report=str(self.report_path), log=log)
         self._start(WORLD, WORLD, options.as_json())
+
+    def _world(self) -> WorldOptions:
+        """The world's options with the endpoints and certificates of this deployment."""
+        listen = self.options.world.listen if self.routers else self.endpoint
+        return replace(self.options.world, listen=listen, routers=self.routers, certs=self.certs)
+
+    def _start_router(self, endpoint: str) -> None:
+        name = f"{ROUTER}_{self.routers.index(endpoint)}"
+        self._start(name, ROUTER, replace(self._world(), listen=endpoint).as_json())
+
+    def router_names(self) -> list[str]:
+        """The names of the routers' processes."""
+        return [f"{ROUTER}_{number}" for number in range(len(self.routers))]
+
+    def _way(self, agent: int) -> str:
+        """Where an agent connects: the routers one after the other, each agent with another one first."""
+        first = agent % max(len(self.routers), 1)
+        return ",".join(self.routers[first:] + self.routers[:first]) or self.endpoint
 
     def start_agent(self, agent: int) -> None:
         """Start an agent's process; again, if it has died."""
@@ -150,7 +171,7 @@ class Deployment:
             agent=agent,
             policy=self.policies[agent],
             run=self.options.world.run,
-            connect=self.routes.get(agent, self.endpoint),
+            connect=self.routes.get(agent) or self._way(agent),
             certs=self.certs,
             join_timeout=self.options.world.ready_timeout,
             lease=self.options.world.lease,
@@ -241,8 +262,12 @@ class Deployment:
         )
 
     def _let_leave(self) -> None:
-        end = time.monotonic() + LEAVE
-        while time.monotonic() < end and any(child.pid for child in self.children.values()):
+        end, routers = time.monotonic() + LEAVE, self.router_names()
+        while time.monotonic() < end and any(c.pid for name, c in self.children.items() if name not in routers):
+            self.look(POLL)
+        for name in routers:
+            self.signal(name, SIGTERM)
+        while time.monotonic() < end and any(self.children[name].pid for name in routers):
             self.look(POLL)
 
     def close(self) -> None:

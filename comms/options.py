@@ -42,6 +42,8 @@ class WorldOptions:
         plant_factory: `package.module:function` that makes the Plant from these options; "": the domain's simulator.
         run: the run's name, part of every key.
         listen: endpoint, port 0 takes a free one.
+        routers: `tls/` endpoints of routers (marl_sched.comms.router), by which agents reach a world that then does not
+            listen itself; port 0 takes a free one where they are deployed.
         certs: folder of certificates, which a `tls/` endpoint needs; see `marl-sched certs`.
         insecure: whether to do without certificates on a `tcp/` endpoint, although whoever connects can then answer in
             an agent's name and hear what all agents hear. A world on the loopback interface needs no such word.
@@ -71,6 +73,7 @@ class WorldOptions:
     plant_factory: str = ""
     run: str = "run"
     listen: str = DEFAULT_ENDPOINT
+    routers: tuple[str, ...] = ()
     certs: str = ""
     insecure: bool = False
     conflict: Conflict = "turns"
@@ -94,6 +97,9 @@ class WorldOptions:
         """Refuse what cannot be run."""
         run_prefix(self.run)
         Faults.of(self.faults)
+        for endpoint in self.routers:
+            if not is_encrypted(endpoint):
+                raise InvalidOptionError(f"routers: expected an endpoint on tls/ such as tls/a:7447, got {endpoint}")
         if not self.insecure and not is_loopback(self.listen) and not is_encrypted(self.listen):
             raise InvalidOptionError(
                 f"listen: {self.listen} is reached by other machines, and {INSECURE.format('it')}. Listen on tls/ with "
@@ -129,9 +135,9 @@ class WorldOptions:
             unheard=max(6 * self.heartbeat, 3 * self.lease),
         )
 
-    def identity(self) -> Identity | None:
+    def identity(self, name: str = WORLD) -> Identity | None:
         """The world's certificate, None without `certs`; InvalidOptionError for a folder that lacks it."""
-        return Identity(Path(self.certs), WORLD) if self.certs else None
+        return Identity(Path(self.certs), name) if self.certs else None
 
     def as_json(self) -> dict[str, Any]:
         """Plain data, from which a process of the deployment makes equal options."""

@@ -39,6 +39,7 @@ from marl_sched.comms.protocol import events as ev
 from marl_sched.comms.protocol import keys
 from marl_sched.comms.protocol import messages as wire
 from marl_sched.comms.protocol.world_protocol import WorldProtocol
+from marl_sched.comms.security.identity import Identity
 from marl_sched.comms.transport.base import Transport
 from marl_sched.comms.transport.faulty import Faults, FaultyTransport
 from marl_sched.errors import DeploymentError, InvalidMessageError
@@ -289,8 +290,6 @@ def serve(options: WorldOptions, progress: Progress | None = None) -> RunReport:
     another run, and the typed errors of a problem that does not exist.
     """
     from marl_sched.comms.security.refusals import counted_refusals
-    from marl_sched.comms.transport.endpoints import settle_port
-    from marl_sched.comms.transport.zenoh_session import hub
 
     set_up_logs(options.log_format, "world", options.run)
     commits: CommitLog = MemoryLog()
@@ -298,14 +297,7 @@ def serve(options: WorldOptions, progress: Progress | None = None) -> RunReport:
         commits = FileLog(Path(options.log), Header.of(options), options.sync)
     identity, plant, refused = options.identity(), options.plant(), Refusals()
     with counted_refusals(refused.count, refused.tell):
-        transport: Transport = hub(
-            options.run,
-            settle_port(options.listen),
-            options.domain.agent_prefix,
-            options.lease,
-            identity=identity,
-            channels=plant.channels,
-        )
+        transport = _session(options, identity, plant)
         if options.faults:
             transport = FaultyTransport(transport, Faults.of(options.faults), 0)
         try:
@@ -314,6 +306,23 @@ def serve(options: WorldOptions, progress: Progress | None = None) -> RunReport:
                 return world.run()
         finally:
             transport.close()
+
+
+def _session(options: WorldOptions, identity: Identity | None, plant: Plant) -> Transport:
+    """The hub that agents connect to, or a session with one of the routers that they connect to."""
+    from marl_sched.comms.transport.endpoints import settle_port
+    from marl_sched.comms.transport.zenoh_session import hub, spoke
+
+    if options.routers:
+        return spoke(options.run, ",".join(options.routers), options.ready_timeout, options.lease, identity=identity)
+    return hub(
+        options.run,
+        settle_port(options.listen),
+        options.domain.agent_prefix,
+        options.lease,
+        identity=identity,
+        channels=plant.channels,
+    )
 
 
 def exit_code_of(report: RunReport) -> int:

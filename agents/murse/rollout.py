@@ -34,7 +34,7 @@ from marl_sched.privileged import PrivilegedInfo
 from marl_sched.simulation import TurnSimulator
 
 if TYPE_CHECKING:
-    from marl_sched.domain import LocalState
+    from marl_sched.domain_parts import LocalState
     from marl_sched.envs.murse.local_state import MurseLocalState
 
 CHARGES = np.array([0.0, 2.0])

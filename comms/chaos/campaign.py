@@ -19,7 +19,7 @@ from marl_sched.comms.chaos.stops import end_many, plan, processes_of
 from marl_sched.comms.metrics.report import RunReport
 from marl_sched.comms.options import DeployOptions, WorldOptions
 from marl_sched.comms.protocol.events import ExitCode
-from marl_sched.comms.transport.endpoints import settle_port
+from marl_sched.comms.transport.endpoints import settle_port, split_endpoints
 from marl_sched.errors import MarlSchedError
 
 ENDLESS = 10**6  # a horizon that no case comes to
@@ -142,7 +142,8 @@ def _left_behind(run: str, scene: Scene) -> list[str]:
     if certs and Path(certs).exists():
         found.append(f"{certs} was left behind")
     try:
-        settle_port(scene.deployment.endpoint)
+        for endpoint in split_endpoints(scene.deployment.endpoint):
+            settle_port(endpoint)
     except MarlSchedError as error:
         found.append(str(error))
     return found

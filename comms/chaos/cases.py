@@ -148,6 +148,13 @@ CASES: tuple[Case, ...] = (
     Case(name="one agent frozen for 15 s", fault=lambda s: s.freeze(s.names[1], 15.0), needs=("frozen", "thawed")),
     Case(name="all agents killed", fault=lambda s: s.kill(*s.names), needs=("killed",)),
     Case(name="world (hub) killed", fault=lambda s: s.kill(WORLD), needs=("killed",), heard_s=RECONNECTED),
+    Case(
+        name="one of two routers killed",
+        fault=lambda s: s.kill("router_0"),
+        needs=("killed",),
+        world={"routers": ("tls/127.0.0.1:0", "tls/127.0.0.1:0")},
+        heard_s=RECONNECTED,
+    ),
     Case(name="world frozen for 3 s", fault=lambda s: s.freeze(WORLD, 3.0), needs=("frozen",), heard_s=RECONNECTED),
     Case(name="world frozen for 15 s", fault=lambda s: s.freeze(WORLD, 15.0), needs=("frozen",), heard_s=RECONNECTED),
     Case(

@@ -83,7 +83,8 @@ class Scene:
     @property
     def names(self) -> list[str]:
         """All agents' names."""
-        return [name for name in self.deployment.children if name != WORLD]
+        others = (WORLD, *self.deployment.router_names())
+        return [name for name in self.deployment.children if name not in others]
 
     def start(self) -> None:
         """Wait until the run runs, and watch it from then on."""

@@ -11,14 +11,31 @@ from collections.abc import Sequence
 from typing import Any
 
 from marl_sched.comms.protocol import keys
-from marl_sched.comms.security.identity import OBSERVER, OPERATOR
+from marl_sched.comms.security.identity import OBSERVER, OPERATOR, ROUTER, WORLD
 
 _SUBSCRIBE = ["declare_subscriber"]
+_ALL = [
+    "put", "delete", "query", "reply", "declare_subscriber", "declare_queryable", "liveliness_token",
+    "liveliness_query", "declare_liveliness_subscriber",
+]  # fmt: skip
 _WATCH = ["declare_liveliness_subscriber", "liveliness_query"]
 
 
 def named_rules(run: str, prefix: str, channels: Sequence[Sequence[str]]) -> dict[str, Any]:
     """Access rules for agents `<prefix>_<i>`, who may hear `channels[i]`, observers and operators, by certificate."""
+    return _named(run, prefix, channels).section()
+
+
+def router_rules(run: str, prefix: str, channels: Sequence[Sequence[str]]) -> dict[str, Any]:
+    """The same for a router, which also passes on all that the world and other routers say, ask and hear."""
+    rules = _named(run, prefix, channels)
+    for name in (WORLD, ROUTER):
+        for flow in ("ingress", "egress"):
+            rules.add(name, f"route {flow}", flow, _ALL, ["**"])
+    return rules.section()
+
+
+def _named(run: str, prefix: str, channels: Sequence[Sequence[str]]) -> _Rules:
     rules = _Rules(keys.run_prefix(run))
     for agent, heard in enumerate(channels):
         rules.add_agent(f"{prefix}_{agent}", keys.AgentKeys(prefix), str(agent), heard)
@@ -28,7 +45,7 @@ def named_rules(run: str, prefix: str, channels: Sequence[Sequence[str]]) -> dic
     rules.add(OPERATOR, "order", "ingress", ["query"], [keys.COMMAND])
     rules.add(OPERATOR, "answered", "egress", ["reply"], [keys.COMMAND])
     rules.add_hub(OPERATOR)
-    return rules.section()
+    return rules
 
 
 def open_rules(run: str, prefix: str) -> dict[str, Any]:

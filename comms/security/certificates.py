@@ -2,7 +2,8 @@
 
 A folder of certificates holds `ca.pem` and, for each name, `<name>.pem` and `<name>.key`; `ca.key` stays where the
 certificates are made. The certificate's common name is what the world's access rules go by: `world`, `observer`, or an
-agent's name such as `crew_3`. Only the world's certificate can be a server's, so no agent can listen in its place.
+agent's name such as `crew_3`. Only the certificates of the world and of routers can be a server's, so no agent can
+listen in their place.
 Private keys are readable by their owner alone. P-256, SHA-256; nothing can be revoked but by a new authority.
 """
 
@@ -21,7 +22,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, load_pem_private_key
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from marl_sched.comms.security.identity import AUTHORITY, OBSERVER, OPERATOR, WORLD
+from marl_sched.comms.security.identity import AUTHORITY, OBSERVER, OPERATOR, ROUTER, WORLD
 from marl_sched.errors import InvalidFileError, InvalidOptionError
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
@@ -30,7 +31,7 @@ _NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 
 
 def make_certificates(folder: Path, names: Sequence[str], *, hosts: Sequence[str] = (), days: int = DAYS) -> list[str]:
-    """Certificates for `names`, `world`, `observer` and `operator`, signed by the folder's authority.
+    """Certificates for `names`, `world`, `router`, `observer` and `operator`, signed by the folder's authority.
 
     The authority is made if there is none.
 
@@ -49,10 +50,10 @@ def make_certificates(folder: Path, names: Sequence[str], *, hosts: Sequence[str
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     authority = _Authority.load(folder) if (folder / f"{AUTHORITY}.pem").exists() else _Authority.make(folder, days)
     made = []
-    for name in dict.fromkeys((WORLD, OBSERVER, OPERATOR, *names)):
+    for name in dict.fromkeys((WORLD, ROUTER, OBSERVER, OPERATOR, *names)):
         if (folder / f"{name}.pem").exists():
             continue
-        authority.issue(folder, name, addresses if name == WORLD else [], days)
+        authority.issue(folder, name, addresses if name in (WORLD, ROUTER) else [], days)
         made.append(name)
     return made
 
@@ -116,15 +117,15 @@ class _Authority:
         return cls(certificate, key)
 
     def issue(self, folder: Path, name: str, served: Sequence[x509.GeneralName], days: int) -> None:
-        """A certificate and its key, written to the folder: a server's at addresses `served`, a client's without."""
-        usage = ExtendedKeyUsageOID.SERVER_AUTH if served else ExtendedKeyUsageOID.CLIENT_AUTH
+        """A certificate and its key, written to the folder: a client's; with addresses `served` a server's too."""
+        usages = [ExtendedKeyUsageOID.CLIENT_AUTH, *[ExtendedKeyUsageOID.SERVER_AUTH] * bool(served)]
         alternative = x509.SubjectAlternativeName(served or [x509.DNSName(name.replace("_", "-"))])
         key = ec.generate_private_key(ec.SECP256R1())
         certificate = (
             _builder(_common_name(name), self._certificate.subject, key.public_key(), days)
             .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
             .add_extension(_key_usage(signs=False), critical=True)
-            .add_extension(x509.ExtendedKeyUsage([usage]), critical=False)
+            .add_extension(x509.ExtendedKeyUsage(usages), critical=False)
             .add_extension(alternative, critical=False)
             .sign(self._key, hashes.SHA256())
         )

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from marl_sched.errors import InvalidOptionError
 
-AUTHORITY, WORLD, OBSERVER, OPERATOR = "ca", "world", "observer", "operator"
+AUTHORITY, WORLD, ROUTER, OBSERVER, OPERATOR = "ca", "world", "router", "observer", "operator"
 
 
 @dataclass(frozen=True)
@@ -16,7 +16,7 @@ class Identity:
 
     Attributes:
         folder: as `marl-sched certs` fills it.
-        name: the common name, `world`, `observer`, `operator` or an agent's name.
+        name: the common name, `world`, `router`, `observer`, `operator` or an agent's name.
     """
 
     folder: Path

@@ -30,10 +30,20 @@ def is_loopback(endpoint: str) -> bool:
         return False
 
 
-def is_encrypted(endpoint: str) -> bool:
-    """Whether both sides show certificates."""
-    check_endpoint("endpoint", endpoint)
-    return endpoint.startswith("tls/")
+def split_endpoints(endpoints: str) -> list[str]:
+    """The endpoints of a list such as `tls/host-1:7447,tls/host-2:7447`, of which one that answers is enough."""
+    return endpoints.split(",")
+
+
+def is_encrypted(endpoints: str) -> bool:
+    """Whether both sides show certificates; InvalidOptionError for endpoints of which only some do."""
+    found = split_endpoints(endpoints)
+    for endpoint in found:
+        check_endpoint("endpoint", endpoint)
+    encrypted = {endpoint.startswith("tls/") for endpoint in found}
+    if len(encrypted) > 1:
+        raise InvalidOptionError(f"endpoint: expected all of them on tls/ or none, got {endpoints}")
+    return encrypted.pop()
 
 
 def settle_port(endpoint: str) -> str:

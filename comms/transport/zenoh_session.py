@@ -32,7 +32,7 @@ from marl_sched.comms.protocol.keys import MAX_KEY, run_prefix
 from marl_sched.comms.security.access import named_rules, open_rules
 from marl_sched.comms.security.identity import Identity
 from marl_sched.comms.transport.base import MAX_PAYLOAD
-from marl_sched.comms.transport.endpoints import check_endpoint, is_encrypted
+from marl_sched.comms.transport.endpoints import check_endpoint, is_encrypted, split_endpoints
 from marl_sched.comms.transport.inbox import Inbox
 from marl_sched.errors import DeploymentError, InvalidOptionError
 
@@ -173,16 +173,20 @@ class ZenohTransport:
     def close(self) -> None:
         """See Transport.close."""
         self._tokens, self._subscribers, self._rings = {}, {}, {}
-        closing = threading.Thread(target=_close, args=(self._session,), daemon=True)
-        closing.start()
-        closing.join(CLOSE_S)
+        close_soon(self._session)
 
     def _local(self, key: Any) -> str:
         return str(key).removeprefix(self._prefix)
 
 
+def close_soon(session: zenoh.Session) -> None:
+    """Close a session, in CLOSE_S at most. Zenoh waits 10 s for a peer that is frozen, and nobody waits for that."""
+    closing = threading.Thread(target=_close, args=(session,), daemon=True)
+    closing.start()
+    closing.join(CLOSE_S)
+
+
 def _close(session: zenoh.Session) -> None:
-    """Close a session. Zenoh waits 10 s for a peer that is frozen, and nobody waits for that."""
     try:
         session.close()
     except zenoh.ZError as error:
@@ -222,7 +226,10 @@ def hub(
 def spoke(
     run: str, endpoint: str, timeout: float, lease: float = DEFAULT_LEASE, *, identity: Identity | None = None
 ) -> ZenohTransport:
-    """An agent's session, connected to the world's endpoint; waits up to `timeout` seconds for it.
+    """An agent's session, connected to the world's endpoint or to one of several routers'.
+
+    It waits up to `timeout` seconds for it. Where there are several, separated by commas, another one is connected to
+    when the first is gone.
 
     `identity` is the agent's certificate, which a `tls/` endpoint asks for; InvalidOptionError as for `hub`.
     """
@@ -233,7 +240,7 @@ def spoke(
         while True:
             obstacle: Exception | None = None
             if identity is not None:
-                obstacle = _knock(endpoint, min(KNOCK, max(end - time.monotonic(), 0.01)), identity)
+                obstacle = _knock_at_any(endpoint, min(KNOCK, max(end - time.monotonic(), 0.01)), identity)
             if obstacle is None:
                 session = _connect(endpoint, min(CONNECT_SLICE, end - time.monotonic()), lease, identity)
                 if not isinstance(session, zenoh.ZError):
@@ -257,11 +264,22 @@ def _connect(endpoint: str, seconds: float, lease: float, identity: Identity | N
     """A session connected to an endpoint, or why there was none in time. Signals wait for it to return."""
     retry = {"period_init_ms": 100, "period_max_ms": 400, "period_increase_factor": 2.0}
     timeout_ms = max(int(seconds * 1000), 1)
-    connect = {"endpoints": [endpoint], "timeout_ms": timeout_ms, "exit_on_failure": True, "retry": retry}
+    endpoints = split_endpoints(endpoint)
+    connect = {"endpoints": endpoints, "timeout_ms": timeout_ms, "exit_on_failure": True, "retry": retry}
     try:
         return zenoh.open(config_of(endpoint, lease, identity, mode="client", connect=connect))
     except zenoh.ZError as error:
         return error
+
+
+def _knock_at_any(endpoints: str, seconds: float, identity: Identity) -> OSError | None:
+    """As `_knock`, at one endpoint after the other until one answers."""
+    obstacle: OSError | None = None
+    for endpoint in split_endpoints(endpoints):
+        obstacle = _knock(endpoint, seconds, identity)
+        if obstacle is None:
+            return None
+    return obstacle
 
 
 def _knock(endpoint: str, seconds: float, identity: Identity) -> OSError | None:
@@ -288,7 +306,7 @@ def _why(endpoint: str, error: Exception) -> str:
     if not isinstance(error, zenoh.ZError):
         return str(error)
     try:
-        with socket.create_connection(check_endpoint("connect", endpoint), CONNECT_SLICE):
+        with socket.create_connection(check_endpoint("connect", split_endpoints(endpoint)[0]), CONNECT_SLICE):
             return _plain(error)
     except OSError as obstacle:
         return f"{obstacle.strerror or obstacle} ({_plain(error)})"
@@ -308,7 +326,7 @@ def config_of(endpoint: str, lease: float, identity: Identity | None, **sections
         "protocols": [endpoint.partition("/")[0]],
     }
     if identity is not None:
-        link["tls"] = _certificates(identity, "listen" if "listen" in sections else "connect")
+        link["tls"] = _certificates(identity, [way for way in ("listen", "connect") if way in sections])
     whole: Mapping[str, Any] = {
         **sections,
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}, "delay": 0},
@@ -317,11 +335,15 @@ def config_of(endpoint: str, lease: float, identity: Identity | None, **sections
     return zenoh.Config.from_json5(json.dumps(whole))
 
 
-def _certificates(identity: Identity, way: str) -> dict[str, Any]:
+def _certificates(identity: Identity, ways: Sequence[str]) -> dict[str, Any]:
+    shown = {
+        name: str(path)
+        for way in ways
+        for name, path in ((f"{way}_certificate", identity.certificate), (f"{way}_private_key", identity.key))
+    }
     return {
         "root_ca_certificate": str(identity.authority),
         "enable_mtls": True,
         "verify_name_on_connect": True,
-        f"{way}_certificate": str(identity.certificate),
-        f"{way}_private_key": str(identity.key),
+        **shown,
     }

@@ -33,6 +33,8 @@ def add_to(app: typer.Typer) -> None:
     """Register this file's commands."""
     example = f"Example: marl-sched world {_PROBLEM} --certs certs --listen tls/0.0.0.0:7447 --json run.json"
     app.command(epilog=example, context_settings=DOMAIN_OPTIONS)(takes(Plant)(world))
+    example = f"Example: marl-sched router {_PROBLEM} --certs certs --router tls/a:7447 --router tls/b:7447 "
+    app.command(epilog=f"{example}--listen tls/a:7447", context_settings=DOMAIN_OPTIONS)(takes(Plant)(router))
     app.command(epilog="Example: marl-sched agent --agent 3 --policy condition --certs certs --connect tls/plant:7447")(
         agent
     )
@@ -59,6 +61,17 @@ def world(
     with progress_bar() as tell:
         report = serve(chosen, _warning_of_insecurity(chosen, tell))
     finish(report)
+
+
+def router(
+    plant: Plant,
+    *,
+    listen: Annotated[str, typer.Option("--listen", metavar="ENDPOINT", help="Where to listen, one of the --router.")],
+) -> None:
+    """Be a router of a run: with two of them the loss of one ends no run. Takes the problem that the world plays."""
+    from marl_sched.comms.router import route
+
+    route(plant.world_options(listen, None))
 
 
 def agent(

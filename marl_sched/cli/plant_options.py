@@ -53,6 +53,14 @@ class Plant:
     ] = ""
     run: Annotated[str, typer.Option("--run", help="The run's name, by which its processes find each other.")] = "run"
     certs: Certs = None
+    routers: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--router",
+            metavar="ENDPOINT",
+            help="A router by which agents reach the world; may be repeated.",
+        ),
+    ] = None
     insecure: Annotated[
         bool,
         typer.Option("--insecure", help="No certificates: whoever connects can answer in an agent's name and listen."),
@@ -112,6 +120,7 @@ class Plant:
             plant_factory=self.plant_factory,
             run=self.run,
             listen=listen,
+            routers=tuple(self.routers or ()),
             certs=str(self.certs or ""),
             insecure=self.insecure,
             conflict=self.conflict,  # type: ignore[arg-type]  # WorldOptions refuses other words

@@ -14,8 +14,8 @@ from marl_sched.domain import get_domain
 
 COMMANDS = [
     "generate", "template", "import", "fit", "advise", "schedule", "validate", "evaluate", "compare", "bench", "tables",
-    "bound", "train", "resume", "export", "export-onnx", "curves", "world", "agent", "deploy", "replay", "certs",
-    "chaos", "order", "watch", "demo", "list", "doctor",
+    "bound", "train", "resume", "export", "export-onnx", "curves", "world", "router", "agent", "deploy", "replay",
+    "certs", "chaos", "order", "watch", "demo", "list", "doctor",
 ]  # fmt: skip
 AIRME = get_domain("airme")
 SHORT = ("--instances", 2, "--episodes", 2, "--hours", 24, "--seed", 3)

@@ -23,7 +23,7 @@ from marl_sched.problem import Problem
 def folder(tmp_path_factory) -> Path:
     made = tmp_path_factory.mktemp("certs") / "run"
     assert make_certificates(made, ["crew_0", "crew_1"], hosts=["plant.local", "10.0.0.5"]) == [
-        "world", "observer", "operator", "crew_0", "crew_1",
+        "world", "router", "observer", "operator", "crew_0", "crew_1",
     ]  # fmt: skip
     return made
 
@@ -74,7 +74,7 @@ def test_agents_certificate_cannot_serve_nor_the_worlds_at_another_address(folde
 def test_private_keys_are_their_owners_alone(folder):
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
     keys = sorted(folder.glob("*.key"))
-    assert [key.stem for key in keys] == ["ca", "crew_0", "crew_1", "observer", "operator", "world"]
+    assert [key.stem for key in keys] == ["ca", "crew_0", "crew_1", "observer", "operator", "router", "world"]
     assert {stat.S_IMODE(key.stat().st_mode) for key in keys} == {0o600}
 
 
