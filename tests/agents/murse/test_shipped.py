@@ -23,7 +23,7 @@ def test_the_planning_policy_is_shorter_than_the_rule():
     assert learned["feasible"].mean() >= rule["feasible"].mean()
 
 
-@pytest.mark.parametrize(("name", "scale"), [("robognn", "robots-small")])
+@pytest.mark.parametrize(("name", "scale"), [("robognn", "robots-small"), ("schedulenet", "heterogeneous-10-small")])
 def test_planners_that_build_steps_solve_more_than_the_rule(name: str, scale: str):
     """One pass, on instances that neither training nor validation nor export has drawn."""
     problem = Problem("murse", scale=scale, count=60, seed=90003, episodes=1, horizon=1)
