@@ -142,15 +142,16 @@ COSTS_OF_PAIRS := $(PAIRS) algorithm=choice_costs algorithm.criterion=expected_c
 policy-hybridnet: $(INSTALLED)
 	$(call trained,hybridnet-costs,$(COSTS_OF_PAIRS) policy=hybridnet 'env.scales=[small,medium]' updates=350 \
 		algorithm.epochs=2 validation.every=50 validation.instances=150)
-	$(call trained,hybridnet,$(PAIRS) algorithm=greedy_rollout policy=hybridnet 'env.scales=[small,medium]' updates=150 \
-		algorithm.learning_rate=3e-4 validation.every=25 validation.instances=150 \
+	$(call trained,hybridnet,$(PAIRS) algorithm=greedy_rollout policy=hybridnet 'env.scales=[small,medium]' updates=80 \
+		algorithm.learning_rate=5e-4 validation.every=20 validation.instances=150 \
 		start_from=runs/hybridnet-costs/policy.safetensors)
 	$(BIN)/marl-sched export runs/hybridnet hybridnet --out agents/policies/shipped --scales small,medium,large \
-		--episodes 1 --length 1
+		--instances 60 --episodes 1 --length 1
 
 policy-hetgat-interactive: $(INSTALLED)
 	$(call trained,hetgat-interactive,$(COSTS_OF_PAIRS) policy=hetgat_interactive policy.width=8 policy.heads=2 \
-		'env.scales=[small]' updates=200 validation.every=25 validation.instances=100)
+		'env.scales=[small]' updates=200 algorithm.instances=16 algorithm.epochs=1 validation.every=40 \
+		validation.instances=60)
 	$(BIN)/marl-sched export runs/hetgat-interactive hetgat-interactive --out agents/policies/shipped \
 		--scales small,medium,large --episodes 1 --length 1 --instances 40
 
