@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from marl_sched.agents.base import ObservationScheduler, Scheduler
 from marl_sched.agents.policies.cards import Mode, PolicyCard, read_card
-from marl_sched.agents.policies.trained import Runtime
 from marl_sched.domain import Domain, domain_names, get_domain
 from marl_sched.errors import InvalidFileError, InvalidOptionError, MarlSchedError, UnknownNameError, require
+from marl_sched.light import Runtime
 from marl_sched.plugins import SCHEDULERS, import_object, is_object_name, load_offered, offered
 
 if TYPE_CHECKING:

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, get_args
 
-from marl_sched.agents.policies.trained import Runtime
 from marl_sched.comms.logs import LogFormat
 from marl_sched.comms.protocol.keys import run_prefix
 from marl_sched.comms.security.identity import Identity
 from marl_sched.comms.transport.faulty import Faults
 from marl_sched.errors import InvalidOptionError, require
+from marl_sched.light import Runtime
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 

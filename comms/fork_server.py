@@ -30,7 +30,7 @@ from marl_sched.comms.protocol.events import ExitCode
 from marl_sched.errors import InvalidOptionError, MarlSchedError
 
 if TYPE_CHECKING:
-    from marl_sched.agents.policies.trained import Runtime
+    from marl_sched.light import Runtime
 
 Roles = dict[str, tuple[type, Callable[..., Any], Callable[[Any], int]]]  # role -> (options' type, body, exit code)
 GRACE = 4.0  # seconds that processes have to end when asked to, before they are killed

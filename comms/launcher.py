@@ -21,7 +21,6 @@ from typing import Any
 from msgspec import structs
 
 from marl_sched.agents.light import create_light_scheduler
-from marl_sched.agents.policies.trained import Runtime
 from marl_sched.agents.registry import create_scheduler, scheduler_names
 from marl_sched.comms.agent_options import AgentOptions
 from marl_sched.comms.children import BEING_STARTED, LEAVE, Child, ForkServerClient, Said
@@ -35,7 +34,7 @@ from marl_sched.comms.transport.endpoints import is_encrypted, settle_port
 from marl_sched.domain import Domain
 from marl_sched.errors import DeploymentError
 from marl_sched.files import read_json, write_json
-from marl_sched.light import light_domain
+from marl_sched.light import Runtime, light_domain
 
 POLL = 0.05  # seconds between two looks at the processes
 FIRST_DELAY, LAST_DELAY, STEADY = 0.1, 5.0, 30.0  # seconds: until a restart, at most, and alive until that is forgotten

@@ -10,7 +10,6 @@ import numpy as np
 from marl_sched.agents.base import ObservationScheduler, Scheduler
 from marl_sched.agents.light import create_light_scheduler
 from marl_sched.agents.local_rule import LocalRule
-from marl_sched.agents.policies.trained import Runtime
 from marl_sched.agents.recurrent import LocalAgent, RecurrentScheduler
 from marl_sched.agents.registry import create_scheduler
 from marl_sched.comms.agent_options import AgentOptions
@@ -18,7 +17,7 @@ from marl_sched.comms.protocol import messages as wire
 from marl_sched.domain import Domain, get_domain
 from marl_sched.domain_parts import LocalState
 from marl_sched.errors import DeploymentError, InvalidMessageError, InvalidOptionError
-from marl_sched.light import LightDomain, light_domain
+from marl_sched.light import LightDomain, Runtime, light_domain
 
 
 class PolicyMind:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
-from marl_sched.agents.policies.trained import Runtime
 from marl_sched.comms.agent_options import DEFAULT_ENDPOINT, require_positive
 from marl_sched.comms.logs import LogFormat
 from marl_sched.comms.protocol.keys import run_prefix
@@ -18,6 +17,7 @@ from marl_sched.comms.transport.faulty import Faults
 from marl_sched.domain import Domain
 from marl_sched.domain_parts import Telemetry
 from marl_sched.errors import InvalidOptionError, require
+from marl_sched.light import Runtime
 from marl_sched.plugins import import_object
 from marl_sched.problem import Problem
 

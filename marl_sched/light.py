@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from marl_sched.graph import GraphSpec
 
 GROUP = "marl_sched.light_domains"
+Runtime = Literal["torch", "onnx"]  # what runs a network: PyTorch or onnxruntime
 
 
 @dataclass(frozen=True, kw_only=True)

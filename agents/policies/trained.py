@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal, NamedTuple, TypedDict, Unpack, get_args
+from typing import TYPE_CHECKING, NamedTuple, TypedDict, Unpack, get_args
 
 import numpy as np
 
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 Observation = Mapping[str, np.ndarray]
 Pressing = Callable[[GraphSpec, Observation], np.ndarray]  # see Domain.pressing
-Runtime = Literal["torch", "onnx"]  # what runs a network: PyTorch or onnxruntime
 _NEVER = -1  # before every simulated time
 
 
