@@ -150,8 +150,8 @@ policy-hybridnet: $(INSTALLED)
 
 policy-hetgat-interactive: $(INSTALLED)
 	$(call trained,hetgat-interactive,$(COSTS_OF_PAIRS) policy=hetgat_interactive policy.width=8 policy.heads=2 \
-		'env.scales=[small]' updates=200 algorithm.instances=16 algorithm.epochs=1 validation.every=40 \
-		validation.instances=60)
+		'env.scales=[small]' updates=150 algorithm.instances=12 algorithm.epochs=1 algorithm.temperature=0.01 \
+		algorithm.learning_rate=5e-3 validation.every=20 validation.instances=60)
 	$(BIN)/marl-sched export runs/hetgat-interactive hetgat-interactive --out agents/policies/shipped \
 		--scales small,medium,large --episodes 1 --length 1 --instances 40
 
