@@ -126,7 +126,7 @@ TRAIN_robognn := $(STEPS) policy=robognn updates=300 algorithm.instances=12 vali
 TRAIN_homgnn-10 := $(STEPS) policy=robognn updates=60 algorithm.instances=12 validation.instances=30 'env.scales=[homogeneous-10-small]'
 SCALES_schedulenet := homogeneous-10-small,homogeneous-10-medium,heterogeneous-10-small,heterogeneous-10-medium
 SCALES_robognn := robots-small,robots-medium
-SCALES_homgnn-10 := homogeneous-10-small,homogeneous-10-medium
+SCALES_homgnn-10 := homogeneous-10-small
 
 policy-schedulenet policy-robognn policy-homgnn-10: policy-%: $(INSTALLED)
 	$(call trained,$*,$(TRAIN_$*))
