@@ -54,6 +54,8 @@ class ScheduleNet(MurseStepNetwork):
         config: sizes; published are 64 features, 8 heads, 4 layers.
     """
 
+    usual_candidates = 10.0  # in problems of 40 tasks and fewer there are seldom more
+
     def __init__(self, spec: GraphSpec, config: ScheduleNetConfig) -> None:
         super().__init__(spec)
         self.config = config

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from marl_sched.agents.networks.network import mask_logits
 from marl_sched.agents.networks.planner import StepwiseNetwork
 from marl_sched.agents.policies.cards import PolicyCard
 from marl_sched.errors import InvalidOptionError
-from marl_sched.graph import GraphSpec
+from marl_sched.graph import ACTION_MASK, GraphSpec
 from marl_sched.simulation import TurnSimulator
 
 RULE_WEIGHT = 8.0  # at first, of a candidate's rank, from 0 for the first to nearly 1 for the last
@@ -39,6 +39,9 @@ class MurseStepNetwork(StepwiseNetwork):
 
     It corrects a rule: an untrained one chooses the task that has to start first by `backward_starts`, nearly always.
 
+    Attributes:
+        usual_candidates: beyond so many candidates a step between their ranks weighs as much as between so many.
+
     Args:
         spec: the metagraph.
 
@@ -46,6 +49,7 @@ class MurseStepNetwork(StepwiseNetwork):
     """
 
     permutation_equivariant = True
+    usual_candidates: ClassVar[float] = float("inf")
 
     def __init__(self, spec: GraphSpec) -> None:
         super().__init__()
@@ -57,7 +61,9 @@ class MurseStepNetwork(StepwiseNetwork):
     def corrected(self, values: Tensor, observation: Mapping[str, Tensor]) -> Tensor:
         """Worths (K, N + 2) from the network's corrections; the lowest finite number outside the action mask."""
         ranks = observation["task"][..., TASK.index("candidate_rank")].to(values.dtype)
-        return mask_logits(values - self.rule_weight * ranks, observation)
+        count = (observation[ACTION_MASK] != 0).sum(1, keepdim=True)
+        weight = self.rule_weight * (count / self.usual_candidates).clamp(min=1.0).to(values.dtype)
+        return mask_logits(values - weight * ranks, observation)
 
     def demonstration(self, simulator: TurnSimulator, row: int) -> np.ndarray:
         """See StepwiseNetwork."""
