@@ -98,6 +98,8 @@ class Domain:
             takes before it does nothing; None: there are none such.
         episode_figure: (episodes, title=) -> a figure with a panel for each of the finished episodes, caption ->
             simulator, all on one axis of time; None: the `rgb_array` pictures are put one above the other.
+        frames: a finished episode's simulator -> its moving picture, uint8 (H, W, 3) one after the other; None: it
+            has none.
         legend: what the colours of the `rgb_array` picture mean, meaning -> RGB in 0 .. 255; None: it needs none.
         best_of: (trained policy, number of samples) -> a scheduler that follows the best of the policy's sampled
             schedules, `NAME@samples=K` for users; None: the domain has no such thing.
@@ -146,6 +148,7 @@ class Domain:
     demo: Demo | None = None
     pressing: Callable[[GraphSpec, Mapping[str, np.ndarray]], np.ndarray] | None = None
     episode_figure: Callable[..., Figure] | None = None
+    frames: Callable[[Any], Iterable[np.ndarray]] | None = None
     legend: Mapping[str, Sequence[int]] | None = None
     band: tuple[str, int] | None = None
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -108,6 +108,7 @@ class Demo:
         policy: what decides unless the user says otherwise.
         local_rules: rules that play beside it under its view.
         central_rules: rules that play with the full view, the first and the last also in the picture of the episode.
+        options: more options of the simulator, in both.
         comparison_seed, instances, episodes: of the comparison.
     """
 
@@ -120,3 +121,4 @@ class Demo:
     comparison_seed: int = 90_001
     instances: int = 10
     episodes: int = 2
+    options: Mapping[str, Any] = field(default_factory=dict)

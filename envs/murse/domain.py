@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from marl_sched.domain import Domain
+from marl_sched.domain_parts import Demo
 from marl_sched.envs.murse.formats import instance_files, load
 from marl_sched.envs.murse.generate import SCALES, generate
 from marl_sched.envs.murse.instance import MurseInstance
@@ -46,10 +47,21 @@ MURSE = Domain(
     impossibilities=MurseInstance.impossibilities,
     instance_files=instance_files,
     episode_figure=lazy("marl_sched.envs.murse.render:episode_figure"),
+    frames=lazy("marl_sched.envs.murse.animation:round_frames"),
     telemetry=lazy("marl_sched.envs.murse.telemetry:TELEMETRY"),
     save_schedules=lazy("marl_sched.envs.murse.schedule:save_schedules"),
     schedules=lazy("marl_sched.envs.murse.schedule_files:SCHEDULES"),
     solver_bound=lazy("marl_sched.agents.murse.schedulers:SOLVER_BOUND"),
     advice=lazy("marl_sched.envs.murse.advice:ADVICE"),
     sheet=lazy("marl_sched.envs.murse.sheet:TASKS"),
+    demo=Demo(
+        scale="small",
+        objective="makespan",
+        policy="murse-local-makespan",
+        options={"mode": "online", "durations": "stochastic"},
+        local_rules=("lst-local",),
+        central_rules=("lst", "lst-robust-rollout"),
+        seed=2,  # the first on which agents with local views meet all deadlines; the comparison tells how often they do
+        episodes=1,
+    ),
 )

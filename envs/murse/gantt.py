@@ -34,20 +34,38 @@ def gantt_figure(schedules: Mapping[str, dict[str, Any]], size: tuple[float, flo
     arrows = False
     for axes, (caption, data) in zip(panels, schedules.items(), strict=True):
         axes.set_title(_title(caption, data, figure.get_figwidth()), fontsize=9, loc="left")
-        _bars(axes, data, figure.get_figwidth(), _span(schedules))
-        _deadlines(axes, data, _span(schedules))
-        if len(data["tasks"]) <= _ARROWS:
-            arrows = _waits(axes, data) or arrows
-        axes.set_yticks(range(len(data["agents"])), data["agents"], fontsize=8)
-        axes.set_ylim(len(data["agents"]) - 0.4, -0.6)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.tick_params(axis="x", labelsize=8)
-        axes.set_axisbelow(True)
-        axes.grid(axis="x", color="#e3e8ec", lw=0.6)
+        arrows = _panel(axes, data, figure.get_figwidth(), _span(schedules)) or arrows
     panels[-1].set_xlim(0, 1.02 * _span(schedules))
     panels[-1].set_xlabel("time units", fontsize=9)
     figure.legend(handles=_legend(schedules, arrows), loc="outside lower center", ncols=6, frameon=False, fontsize=8)
     return figure
+
+
+def draw_chart(axes: Any, data: dict[str, Any]) -> None:
+    """The chart of one schedule (marl_sched.envs.murse.schedule) on given axes, without title and legend."""
+    span = last_time(data)
+    _panel(axes, data, axes.figure.get_figwidth(), span)
+    axes.set_xlim(0, 1.02 * span)
+    axes.set_xlabel("time units", fontsize=9)
+
+
+def last_time(data: dict[str, Any]) -> int:
+    """Up to where a schedule's chart reaches: its last finish, at least 1, or a deadline that is not much later."""
+    return _span({"": data})
+
+
+def _panel(axes: Any, data: dict[str, Any], width: float, span: int) -> bool:
+    """The bars, deadlines and waits of a schedule, a row for each agent; whether there is any wait to see."""
+    _bars(axes, data, width, span)
+    _deadlines(axes, data, span)
+    arrows = len(data["tasks"]) <= _ARROWS and _waits(axes, data)
+    axes.set_yticks(range(len(data["agents"])), data["agents"], fontsize=8)
+    axes.set_ylim(len(data["agents"]) - 0.4, -0.6)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.tick_params(axis="x", labelsize=8)
+    axes.set_axisbelow(True)
+    axes.grid(axis="x", color="#e3e8ec", lw=0.6)
+    return arrows
 
 
 def _span(schedules: Mapping[str, dict[str, Any]]) -> int:

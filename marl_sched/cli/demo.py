@@ -38,6 +38,7 @@ def demo(
     from marl_sched.domain import get_domain
     from marl_sched.files import write_json
     from marl_sched.problem import view_in_words
+    from marl_sched.train.evaluation.animation import save_animation
     from marl_sched.train.evaluation.compare import draw_scores, draw_timelines
 
     options.check_folder(out)
@@ -66,6 +67,8 @@ def demo(
         write_json(out / f"results-{name}-view.json", table.as_json())
     draw_scores(out / "scores.png", local, full)
     draw_timelines(out / "timelines.png", domain, episodes, problem.objective)
+    if domain.frames is not None:
+        save_animation(out / "episode.gif", domain.frames(replay))
     for path in sorted(out.iterdir()):
         typer.echo(path)
 
@@ -91,6 +94,7 @@ def deployed_problem(domain: Domain, policy: str) -> Problem:
         episodes=1,
         objective=shown.objective,
         view=local if card is None else card.view,
+        options=dict(shown.options),
     )
 
 
