@@ -63,3 +63,15 @@ def test_hybridnet_is_shorter_than_the_rule_and_its_best_of_eight_shorter_still(
     )
     assert best["makespan"].mean() < greedy["makespan"].mean() < rule["makespan"].mean()
     assert best["feasible"].mean() >= rule["feasible"].mean()
+
+
+def test_the_interactive_hetgat_is_shorter_than_the_rule_on_small_problems():
+    """One pass, on instances that neither training nor validation nor export has drawn."""
+    problem = Problem(
+        "murse", scale="small", count=60, seed=90004, episodes=1, horizon=1, options={"durations": "deterministic"}
+    )
+    learned, rule = (
+        evaluate_scheduler(problem, create_scheduler(name, "murse")).measures for name in ("hetgat-interactive", "lst")
+    )
+    assert learned["makespan"].mean() < rule["makespan"].mean()
+    assert learned["feasible"].mean() >= rule["feasible"].mean()
