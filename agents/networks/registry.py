@@ -50,6 +50,11 @@ class NetworkConfig:
         """An untrained network for a metagraph; torch's generator draws its weights."""
         raise NotImplementedError(type(self).__name__)
 
+    @property
+    def planner_options(self) -> tuple[str, ...]:
+        """Names of options of what plays the network, where it plans whole rounds (PlannerNetwork.planner)."""
+        return ()
+
     def metagraph(self, graph: GraphSpec) -> GraphSpec:
         """The metagraph that the network reads, for a domain whose turns show `graph`; mostly that one."""
         return graph

@@ -108,7 +108,7 @@ def create_schedulers(
     limited = 0
     for word in typed:
         name, *pairs = word.split("@")
-        known = scheduler_options(domain, name)
+        known = scheduler_options(domain, name) + (planner_options(domain, name) if pairs else [])
         given = dict(_option(word, pair, known) for pair in pairs)
         if time_limit is not None and "time_limit" in known:
             given.setdefault("time_limit", time_limit)
@@ -128,6 +128,15 @@ def scheduler_options(domain: Domain, name: str) -> list[str]:
         return [] if domain.best_of is None else ["samples"]
     parameters = inspect.signature(factory).parameters.values()
     return [one.name for one in parameters if one.kind in (one.POSITIONAL_OR_KEYWORD, one.KEYWORD_ONLY)]
+
+
+def planner_options(domain: Domain, name: str) -> list[str]:
+    """The further options of a trained policy that plans whole rounds; none of other schedulers."""
+    from marl_sched.agents.networks.registry import config_of_card
+    from marl_sched.agents.registry import card_of
+
+    card = card_of(name, domain)
+    return [] if card is None else list(config_of_card(card.sizes).planner_options)
 
 
 def _option(word: str, pair: str, known: list[str]) -> tuple[str, Any]:

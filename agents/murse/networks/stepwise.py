@@ -29,6 +29,11 @@ class StepGraphConfig:
 
     __slots__ = ()
 
+    @property
+    def planner_options(self) -> tuple[str, ...]:
+        """See NetworkConfig: those of StepPlanner."""
+        return ("strategy", "look_ahead")
+
     def metagraph(self, graph: GraphSpec) -> GraphSpec:
         """See NetworkConfig: always that of marl_sched.agents.murse.step_graph."""
         return SPEC

@@ -8,8 +8,10 @@ pytest.importorskip("torch")
 
 from marl_sched.agents.murse.networks.hybridnet.planner import RoundPlanner
 from marl_sched.agents.registry import create_scheduler
+from marl_sched.cli.selection import create_schedulers
 from marl_sched.domain import get_domain
 from marl_sched.envs.murse.simulator import MurseSimulator
+from marl_sched.errors import InvalidOptionError, UnknownNameError
 from marl_sched.problem import Problem
 from marl_sched.train.evaluation.evaluate import evaluate_scheduler
 
@@ -75,3 +77,12 @@ def test_the_interactive_hetgat_is_shorter_than_the_rule_on_small_problems():
     )
     assert learned["makespan"].mean() < rule["makespan"].mean()
     assert learned["feasible"].mean() >= rule["feasible"].mean()
+
+
+def test_options_of_a_planner_are_typed_behind_its_name():
+    schedulers = create_schedulers(get_domain("murse"), ["schedulenet@strategy=ensemble@look-ahead=false", "lst"])
+    assert list(schedulers) == ["schedulenet@strategy=ensemble@look-ahead=false", "lst"]
+    with pytest.raises(InvalidOptionError, match="strategy: expected one of first, mean_open"):
+        create_schedulers(get_domain("murse"), ["robognn@strategy=best"])
+    with pytest.raises(UnknownNameError, match="unknown option of scheduler robognn 'speed'"):
+        create_schedulers(get_domain("murse"), ["robognn@speed=2"])
