@@ -55,6 +55,11 @@ GREEDY_ROLLOUT = [
     "updates=4", "save_every=2", "validation.every=2", "validation.instances=2", "validation.length=1",
 ]  # fmt: skip
 
+CHOICE_COSTS = [
+    *(word for word in GREEDY_ROLLOUT if not word.startswith("algorithm")), "algorithm=choice_costs",
+    "algorithm.instances=3", "algorithm.rounds=2",
+]  # fmt: skip
+
 SELF_LABELLING = [
     "algorithm=self_labelling", *(word for word in TINY if ".ppo." not in word), "algorithm.instances=2",
     "algorithm.episodes=2",
@@ -108,6 +113,7 @@ def rows(directory: Path) -> list[dict[str, str]]:
         RANDOM_VIEW,
         SELF_LABELLING,
         GREEDY_ROLLOUT,
+        pytest.param(CHOICE_COSTS, marks=pytest.mark.slow),
         DEMONSTRATIONS,
         pytest.param(IMITATION, marks=pytest.mark.slow),
         pytest.param(ROLLOUT_IMITATION, marks=pytest.mark.slow),
@@ -120,6 +126,7 @@ def rows(directory: Path) -> list[dict[str, str]]:
         "random view",
         "self_labelling",
         "greedy_rollout",
+        "choice_costs",
         "demonstrations",
         "imitation",
         "rollout_imitation",
