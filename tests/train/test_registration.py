@@ -37,7 +37,7 @@ def test_an_algorithms_struct_is_its_yaml_and_has_no_defaults_of_its_own(name: s
 def test_an_unknown_algorithm_or_network_is_refused_with_those_that_are_known():
     with pytest.raises(InvalidOptionError, match=r"unknown network 'lenet'.*Known: decima"):
         load_config(["policy.name=lenet"])
-    with pytest.raises(InvalidOptionError, match=r"unknown algorithm 'trpo'.*Known: demonstrations, gae"):
+    with pytest.raises(InvalidOptionError, match=r"unknown algorithm 'trpo'.*Known: .*gae"):
         load_config(["algorithm.name=trpo"])
 
 
