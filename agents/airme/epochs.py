@@ -14,10 +14,10 @@ import numpy as np
 
 from marl_sched.agents.airme.ranking import CORRECTIVE, Known, Ranking, rank, ranking
 from marl_sched.compiled import entry
-from marl_sched.envs.airme.dynamics import begin_step, decide, pass_hours, require_consistent, take_turn
+from marl_sched.envs.airme.dynamics import begin_step, decide, ends_epoch, pass_hours, require_consistent, take_turn
 from marl_sched.envs.airme.features import INCOME_SCALE, PER_INCOME
 from marl_sched.envs.airme.simulator import AirmeSimulator, example
-from marl_sched.envs.airme.state import IDLE, SINGLE, SKIP, UNDECIDED, Record, Rules, State
+from marl_sched.envs.airme.state import IDLE, UNDECIDED, Record, Rules, State
 from marl_sched.envs.airme.views import ring_distance
 from marl_sched.kernels import kernel
 
@@ -91,7 +91,7 @@ def play_queue(state: State, rules: Rules, b: int, of: Ranking, keys: np.ndarray
             sink(keys, slots, 0, queued)
         decide(state, b, crew, action)
         turns += 1
-        if rules.scheme == SINGLE or (rules.scheme == SKIP and action == IDLE):
+        if ends_epoch(rules.scheme, action):
             break
         while following < row.n_crews and (crews[following].plane != 0 or crews[following].choice != UNDECIDED):
             following += 1

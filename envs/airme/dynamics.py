@@ -296,14 +296,19 @@ def pass_hours(state: State, rules: Rules, b: int) -> None:
     row.acting = -1 if row.terminated or row.truncated else following
 
 
+@kernel(inline="always")
+def ends_epoch(scheme: int, action: int) -> bool:
+    """Whether nobody else is asked at a decision epoch after this action (section 6.3.1)."""
+    return scheme == SINGLE or (scheme == SKIP and action == IDLE)
+
+
 @kernel
 def take_turn(state: State, rules: Rules, b: int, action: int) -> None:
     """The acting crew of row b, which is not over, chooses; after the last one of the hour hours pass."""
     row = state.rows[b]
     begin_step(row)
     decide(state, b, row.acting, action)
-    ends = rules.scheme == SINGLE or (rules.scheme == SKIP and action == IDLE)
-    following = -1 if ends else next_free(state.crews[b], row.n_crews)
+    following = -1 if ends_epoch(rules.scheme, action) else next_free(state.crews[b], row.n_crews)
     if following < 0:
         pass_hours(state, rules, b)
     else:
@@ -320,11 +325,18 @@ def step(state: State, rules: Rules, actions: np.ndarray) -> int:
     bad = first_outside(actions, state.planes.shape[1])
     if bad >= 0:
         return bad
+    # As `take_turn`, written out: handing on the state for every row takes a tenth of the time of a step.
     for b in range(actions.shape[0]):
-        if state.rows[b].acting >= 0:
-            take_turn(state, rules, b, actions[b])
+        row = state.rows[b]
+        begin_step(row)
+        if row.acting < 0:
+            continue
+        decide(state, b, row.acting, actions[b])
+        following = -1 if ends_epoch(rules.scheme, actions[b]) else next_free(state.crews[b], row.n_crews)
+        if following < 0:
+            pass_hours(state, rules, b)
         else:
-            begin_step(state.rows[b])
+            row.acting = following
     return -1
 
 
