@@ -134,10 +134,8 @@ class PairSequences(SequenceNetwork):
         return np.asarray(schedule_costs(finish, rounds, weighted, LEARNED)[0])
 
 
-class HybridNetConfig(
-    NetworkConfig, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field=NAME, tag="hybridnet"
-):
-    """Sizes of HybridNet, and what goes beyond the dissertation; see `Propagator`."""
+class PairSizes(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Sizes that both networks have, and where their logits begin; see `PairNetwork`."""
 
     width: Width
     heads: Heads
@@ -145,29 +143,31 @@ class HybridNetConfig(
     hidden: Width
     edge_width: Width
     residual: Residual
-    timed: bool
 
     def metagraph(self, graph: GraphSpec) -> GraphSpec:
         """That of rounds, whatever turns show."""
         return METAGRAPH
 
+    def pair_sizes(self) -> dict[str, Any]:
+        """The arguments of a PairNetwork."""
+        return {name: getattr(self, name) for name in PairSizes.__struct_fields__}
+
+
+class HybridNetConfig(
+    PairSizes, NetworkConfig, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field=NAME, tag="hybridnet"
+):
+    """Sizes of HybridNet, and what goes beyond the dissertation; see `Propagator`."""
+
+    timed: bool
+
     def build(self, graph: GraphSpec) -> PairSequences:
         """See NetworkConfig."""
-        pairs = Propagator(
-            width=self.width,
-            heads=self.heads,
-            layers=self.layers,
-            hidden=self.hidden,
-            edge_width=self.edge_width,
-            residual=self.residual,
-            timed=self.timed,
-        )
-        return PairSequences(graph, self, pairs)
+        return PairSequences(graph, self, Propagator(**self.pair_sizes(), timed=self.timed))
 
 
 class InteractiveConfig(
+    PairSizes,
     NetworkConfig,
-    Struct,
     frozen=True,
     kw_only=True,
     forbid_unknown_fields=True,
@@ -176,28 +176,9 @@ class InteractiveConfig(
 ):
     """Sizes of the interactive HetGAT; see `Interactive`."""
 
-    width: Width
-    heads: Heads
-    layers: Layers
-    hidden: Width
-    edge_width: Width
-    residual: Residual
-
-    def metagraph(self, graph: GraphSpec) -> GraphSpec:
-        """That of rounds, whatever turns show."""
-        return METAGRAPH
-
     def build(self, graph: GraphSpec) -> PairSequences:
         """See NetworkConfig."""
-        pairs = Interactive(
-            width=self.width,
-            heads=self.heads,
-            layers=self.layers,
-            hidden=self.hidden,
-            edge_width=self.edge_width,
-            residual=self.residual,
-        )
-        return PairSequences(graph, self, pairs)
+        return PairSequences(graph, self, Interactive(**self.pair_sizes()))
 
 
 class RoundPlanner(PlanningScheduler, TrainedPlanner):
